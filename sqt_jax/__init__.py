@@ -1,0 +1,27 @@
+"""SQT, a conservative target for ensemble actor-critics, on TD3 and SAC, as pure JAX functions."""
+
+from sqt_jax import q_targets
+from sqt_jax.algorithms import ALGORITHMS, make_agent, make_config, make_train, make_trainer
+from sqt_jax.config import Config, ConfigError
+from sqt_jax.envs import make as make_env
+from sqt_jax.train import make_sweep
+from sqt_jax.types import Agent, Environment, Replay, Scalars, TimeStep, Transition
+
+__all__ = [
+    "ALGORITHMS",
+    "Agent",
+    "Config",
+    "ConfigError",
+    "Environment",
+    "Replay",
+    "Scalars",
+    "TimeStep",
+    "Transition",
+    "make_agent",
+    "make_config",
+    "make_env",
+    "make_sweep",
+    "make_train",
+    "make_trainer",
+    "q_targets",
+]

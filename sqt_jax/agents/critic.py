@@ -1,0 +1,90 @@
+"""What every agent's critics have in common: the target of the variant, one step, and what is reported of it."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from sqt_jax import losses, q_targets
+from sqt_jax.config import AgentConfig
+from sqt_jax.optimizers import adam_step
+from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
+
+
+def draw_subset(key: Array, config: AgentConfig) -> Array:
+    """The critics [M] of an update's target: a random subset where the reduction asks for one, else all."""
+    if config.reduce == "subset_min":
+        return q_targets.random_subset(key, config.ensemble_size, config.subset_size)
+    return jnp.arange(config.ensemble_size)
+
+
+def _reduction(config: AgentConfig, subset: Array) -> q_targets.Reduction:
+    return {
+        "min": q_targets.min_over_critics,
+        "mean": q_targets.mean_over_critics,
+        "subset_min": functools.partial(q_targets.min_over_subset, subset=subset),
+    }[config.reduce]
+
+
+def _penalty(config: AgentConfig, coef: Array) -> q_targets.Penalty:
+    return {
+        "none": q_targets.no_penalty,
+        "batch_std": functools.partial(q_targets.batch_std, coef=coef, ddof=config.ddof),
+        "transition_std": functools.partial(q_targets.transition_std, coef=coef, ddof=config.ddof),
+    }[config.penalty]
+
+
+def td_target(
+    config: AgentConfig,
+    scalars: Scalars,
+    batch: Transition,
+    next_q: Array,
+    subset: Array,
+    entropy_term: Array | float = 0.0,
+) -> tuple[Array, dict[str, Array]]:
+    """The variant's target from the target critics' values `next_q [N, B]` at (s', a').
+
+    Returns:
+      td_target [B], and its terms by name: `penalty`, [] or [B].
+    """
+    penalty = _penalty(config, scalars.penalty_coef)
+    target = q_targets.td_target(
+        batch.reward,
+        batch.discount,
+        next_q,
+        gamma=scalars.gamma,
+        reduce=_reduction(config, subset),
+        penalty=penalty,
+        entropy_term=entropy_term,
+        penalty_inside_gamma=config.penalty_inside_gamma,
+    )
+    return target, {"penalty": penalty(next_q)}
+
+
+def update(
+    apply: Callable[..., Array], config: AgentConfig, params: Params, opt_state, batch: Transition, target: Array, lr: Array
+) -> tuple[Params, object, Array, Metrics]:
+    """One Adam step of all critics towards `target [B]`.
+
+    Returns:
+      parameters, optimizer state, td_error [B] (the largest |Q_i - target| over the critics), metrics. `q_std` is
+      eq. 18's std[B]: the mean over the batch of the std over the online critics at (s, a).
+    """
+
+    def loss_fn(params):
+        q = apply(params, batch.obs, batch.action)
+        return losses.critic_loss(q, target), q
+
+    (loss, q), grads = jax.value_and_grad(loss_fn, has_aux=True)(params)
+    params, opt_state = adam_step(params, opt_state, grads, lr)
+    td_error = jnp.max(jnp.abs(q - target), axis=0)
+    disagrees = config.ensemble_size > 1
+    metrics = {
+        "critic_loss": loss,
+        "q_mean": jnp.mean(q),
+        "q_std": jnp.mean(q_targets.std_over_critics(q, config.ddof)) if disagrees else jnp.full((), jnp.nan),
+        "td_error": jnp.mean(td_error),
+        "td_target": jnp.mean(target),
+    }
+    return params, opt_state, td_error, metrics

@@ -1,0 +1,121 @@
+"""SAC (https://arxiv.org/abs/1801.01290) with N critics and the variant's target; temperature fixed or learned."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from sqt_jax import losses, networks
+from sqt_jax.agents import critic as critics
+from sqt_jax.config import AgentConfig
+from sqt_jax.optimizers import adam_init, adam_step, soft_update
+from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
+
+
+class SACState(NamedTuple):
+    actor: Params
+    critic: Params
+    target_critic: Params
+    log_temperature: Array  # []: 0 and unused where the temperature is fixed
+    actor_opt: optax.OptState
+    critic_opt: optax.OptState
+    temperature_opt: optax.OptState
+    scalars: Scalars
+    gradient_steps: Array  # [] int32: updates done
+
+
+class SACNoise(NamedTuple):
+    next_action_eps: Array  # [B, A] standard normal: the next action
+    action_eps: Array  # [B, A] standard normal: the actor's own action
+    subset: Array  # [M]: critics of the target
+
+
+def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
+    actor_net = networks.GaussianActor(action_size, config.hidden)
+    critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
+    target_entropy = -float(action_size)
+
+    def init(key: Array, scalars: Scalars | None = None) -> SACState:
+        actor_key, critic_key = jax.random.split(key)
+        obs, action = jnp.zeros((1, observation_size)), jnp.zeros((1, action_size))
+        actor = actor_net.init(actor_key, obs)
+        critic = critic_net.init(critic_key, obs, action)
+        scalars = (scalars or config.scalars()).as_arrays()
+        log_temperature = jnp.log(scalars.temperature) if config.learn_temperature else jnp.zeros(())
+        return SACState(
+            actor=actor,
+            critic=critic,
+            target_critic=critic,
+            log_temperature=log_temperature,
+            actor_opt=adam_init(actor),
+            critic_opt=adam_init(critic),
+            temperature_opt=adam_init(log_temperature),
+            scalars=scalars,
+            gradient_steps=jnp.zeros((), jnp.int32),
+        )
+
+    def act(state: SACState, obs: Array, key: Array, deterministic: bool = False) -> Array:
+        policy = actor_net.apply(state.actor, obs)
+        return policy.mode() if deterministic else policy.sample(jax.random.normal(key, policy.mean.shape))[0]
+
+    def draw_noise(key: Array, batch: Transition) -> SACNoise:
+        next_key, own_key, subset_key = jax.random.split(key, 3)
+        shape = batch.action.shape
+        return SACNoise(
+            next_action_eps=jax.random.normal(next_key, shape),
+            action_eps=jax.random.normal(own_key, shape),
+            subset=critics.draw_subset(subset_key, config),
+        )
+
+    def temperature(state: SACState) -> Array:
+        return jnp.exp(state.log_temperature) if config.learn_temperature else state.scalars.temperature
+
+    def td_target(state: SACState, batch: Transition, noise: SACNoise) -> tuple[Array, dict[str, Array]]:
+        next_action, next_log_prob = actor_net.apply(state.actor, batch.next_obs).sample(noise.next_action_eps)
+        next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
+        entropy_term = temperature(state) * next_log_prob
+        target, terms = critics.td_target(config, state.scalars, batch, next_q, noise.subset, entropy_term)
+        return target, terms | {"next_log_prob": next_log_prob}
+
+    def update_critic(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
+        target, terms = td_target(state, batch, noise)
+        critic, critic_opt, td_error, metrics = critics.update(
+            critic_net.apply, config, state.critic, state.critic_opt, batch, target, state.scalars.lr
+        )
+        return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics | {"penalty": jnp.mean(terms["penalty"])}
+
+    def update_actor(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Metrics]:
+        def loss_fn(actor):
+            action, log_prob = actor_net.apply(actor, batch.obs).sample(noise.action_eps)
+            q = critic_net.apply(state.critic, batch.obs, action)
+            return jnp.mean(temperature(state) * log_prob - losses.actor_value(q, config.actor_reduce)), log_prob
+
+        (loss, log_prob), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
+        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr)
+        metrics = {"actor_loss": loss, "entropy": -jnp.mean(log_prob), "temperature": temperature(state)}
+        state = state._replace(actor=actor, actor_opt=actor_opt)
+        return update_temperature(state, log_prob) if config.learn_temperature else state, metrics
+
+    def update_temperature(state: SACState, log_prob: Array) -> SACState:
+        grad = jax.grad(losses.temperature_loss)(state.log_temperature, log_prob, target_entropy)
+        log_temperature, opt = adam_step(state.log_temperature, state.temperature_opt, grad, state.scalars.lr)
+        return state._replace(log_temperature=log_temperature, temperature_opt=opt)
+
+    def update_with_noise(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
+        state, td_error, metrics = update_critic(state, batch, noise)
+        gradient_steps = state.gradient_steps + 1
+
+        def skip(state, batch, noise):
+            return state, dict.fromkeys(("actor_loss", "entropy", "temperature"), jnp.full((), jnp.nan))  # not measured
+
+        due = gradient_steps % config.policy_delay == 0  # a scalar that members share: a real branch under vmap
+        state, actor_metrics = jax.lax.cond(due, update_actor, skip, state, batch, noise)
+        target_critic = soft_update(state.target_critic, state.critic, state.scalars.tau)
+        state = state._replace(target_critic=target_critic, gradient_steps=gradient_steps)
+        return state, td_error, metrics | actor_metrics
+
+    def update(state: SACState, batch: Transition, key: Array) -> tuple[SACState, Array, Metrics]:
+        return update_with_noise(state, batch, draw_noise(key, batch))
+
+    return Agent(init, act, update, draw_noise, update_with_noise, td_target)

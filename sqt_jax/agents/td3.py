@@ -1,0 +1,114 @@
+"""TD3 (https://arxiv.org/abs/1802.09477) with N critics and the variant's target."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from sqt_jax import losses, networks
+from sqt_jax.agents import critic as critics
+from sqt_jax.config import AgentConfig
+from sqt_jax.optimizers import adam_init, adam_step, soft_update
+from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
+
+
+class TD3State(NamedTuple):
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+    actor_opt: optax.OptState
+    critic_opt: optax.OptState
+    scalars: Scalars
+    gradient_steps: Array  # [] int32: updates done
+
+
+class TD3Noise(NamedTuple):
+    target_noise: Array  # [B, A], scaled, not yet clipped
+    subset: Array  # [M]: critics of the target
+
+
+def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
+    actor_net = networks.TanhActor(action_size, config.hidden)
+    critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
+
+    def init(key: Array, scalars: Scalars | None = None) -> TD3State:
+        actor_key, critic_key = jax.random.split(key)
+        obs, action = jnp.zeros((1, observation_size)), jnp.zeros((1, action_size))
+        actor = actor_net.init(actor_key, obs)
+        critic = critic_net.init(critic_key, obs, action)
+        return TD3State(
+            actor=actor,
+            critic=critic,
+            target_actor=actor,
+            target_critic=critic,
+            actor_opt=adam_init(actor),
+            critic_opt=adam_init(critic),
+            scalars=(scalars or config.scalars()).as_arrays(),
+            gradient_steps=jnp.zeros((), jnp.int32),
+        )
+
+    def act(state: TD3State, obs: Array, key: Array, deterministic: bool = False) -> Array:
+        action = actor_net.apply(state.actor, obs)
+        if deterministic:
+            return action
+        noise = config.exploration_noise * jax.random.normal(key, action.shape)
+        return jnp.clip(action + noise, -1.0, 1.0)
+
+    def draw_noise(key: Array, batch: Transition) -> TD3Noise:
+        noise_key, subset_key = jax.random.split(key)
+        noise = config.target_noise * jax.random.normal(noise_key, batch.action.shape)
+        return TD3Noise(noise, critics.draw_subset(subset_key, config))
+
+    def next_action(state: TD3State, batch: Transition, noise: TD3Noise) -> Array:
+        """The smoothed action of the target policy at s'."""
+        clipped = jnp.clip(noise.target_noise, -config.target_noise_clip, config.target_noise_clip)
+        return jnp.clip(actor_net.apply(state.target_actor, batch.next_obs) + clipped, -1.0, 1.0)
+
+    def td_target(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[Array, dict[str, Array]]:
+        next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action(state, batch, noise))
+        return critics.td_target(config, state.scalars, batch, next_q, noise.subset)
+
+    def update_critic(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array, Metrics]:
+        target, terms = td_target(state, batch, noise)
+        critic, critic_opt, td_error, metrics = critics.update(
+            critic_net.apply, config, state.critic, state.critic_opt, batch, target, state.scalars.lr
+        )
+        return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics | {"penalty": jnp.mean(terms["penalty"])}
+
+    def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
+        def loss_fn(actor):
+            q = critic_net.apply(state.critic, batch.obs, actor_net.apply(actor, batch.obs))
+            return -jnp.mean(losses.actor_value(q, config.actor_reduce))
+
+        loss, grads = jax.value_and_grad(loss_fn)(state.actor)
+        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr)
+        return state._replace(actor=actor, actor_opt=actor_opt), loss
+
+    def update_targets(state: TD3State) -> TD3State:
+        tau = state.scalars.tau
+        return state._replace(
+            target_actor=soft_update(state.target_actor, state.actor, tau),
+            target_critic=soft_update(state.target_critic, state.critic, tau),
+        )
+
+    def update_with_noise(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array, Metrics]:
+        state, td_error, metrics = update_critic(state, batch, noise)
+        gradient_steps = state.gradient_steps + 1
+
+        def delayed(state):
+            state, actor_loss = update_actor(state, batch)
+            return update_targets(state), actor_loss
+
+        def skip(state):
+            return state, jnp.full((), jnp.nan)  # not measured
+
+        due = gradient_steps % config.policy_delay == 0  # a scalar that members share: a real branch under vmap
+        state, actor_loss = jax.lax.cond(due, delayed, skip, state)
+        return state._replace(gradient_steps=gradient_steps), td_error, metrics | {"actor_loss": actor_loss}
+
+    def update(state: TD3State, batch: Transition, key: Array) -> tuple[TD3State, Array, Metrics]:
+        return update_with_noise(state, batch, draw_noise(key, batch))
+
+    return Agent(init, act, update, draw_noise, update_with_noise, td_target)

@@ -1,0 +1,89 @@
+"""The table of algorithms, and how a name becomes a configuration, a trainer, a training run.
+
+A variant is a row: a base algorithm and the settings in which it differs.
+"""
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from sqt_jax import envs, replay, train
+from sqt_jax.agents import sac, td3
+from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check
+from sqt_jax.types import Agent, Environment
+
+
+class Algorithm(NamedTuple):
+    """A row of the table."""
+
+    make_agent: Callable[[AgentConfig, int, int], Agent]  # (config, observation size, action size)
+    settings: dict[str, Any]  # where the row differs from AgentConfig's defaults
+
+
+SQT = {"penalty": "batch_std", "penalty_coef": 0.5}
+SQT_TUPLE = {"penalty": "transition_std", "penalty_coef": 0.1}
+TD3 = {"policy_delay": 2}
+
+ALGORITHMS: dict[str, Algorithm] = {
+    "td3": Algorithm(td3.make, TD3),
+    "td3_sqt": Algorithm(td3.make, TD3 | SQT),
+    "td3_sqt_tuple": Algorithm(td3.make, TD3 | SQT_TUPLE),
+    "sac": Algorithm(sac.make, {}),
+    "sac_sqt": Algorithm(sac.make, SQT),
+    "sac_sqt_tuple": Algorithm(sac.make, SQT_TUPLE),
+}
+
+AGENT_SETTINGS = frozenset(field.name for field in dataclasses.fields(AgentConfig))
+TRAIN_SETTINGS = frozenset(field.name for field in dataclasses.fields(TrainConfig))
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """' (did you mean X?)' where something similar exists, else nothing."""
+    match = difflib.get_close_matches(name, list(names), n=1)
+    return f" (did you mean {match[0]}?)" if match else ""
+
+
+def make_config(algo: str, env: str, **settings: Any) -> Config:
+    """A checked configuration: the defaults, then the algorithm's row, then `settings`.
+
+    Args:
+      algo: a name of `ALGORITHMS`.
+      env: a name that `sqt_jax.envs.make` knows.
+      **settings: fields of `AgentConfig` and `TrainConfig` by name, and `physics`.
+
+    Raises:
+      ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
+    """
+    if algo not in ALGORITHMS:
+        raise ConfigError("algo", f"takes one of {', '.join(ALGORITHMS)}, not {algo!r}{closest(algo, ALGORITHMS)}")
+    try:
+        env = envs.resolve(env)
+    except ValueError as error:
+        raise ConfigError("env", str(error)) from None
+    physics = settings.pop("physics", Config.physics)
+    for name in settings:
+        if name not in AGENT_SETTINGS | TRAIN_SETTINGS:
+            raise ConfigError(name, f"is not a setting{closest(name, AGENT_SETTINGS | TRAIN_SETTINGS)}")
+    agent = ALGORITHMS[algo].settings | {k: v for k, v in settings.items() if k in AGENT_SETTINGS}
+    training = {k: v for k, v in settings.items() if k in TRAIN_SETTINGS}
+    config = Config(algo, env, physics, AgentConfig(**agent), TrainConfig(**training))
+    check(config)
+    return config
+
+
+def make_agent(config: Config, env: Environment) -> Agent:
+    """The agent of a configuration, for an environment's sizes."""
+    return ALGORITHMS[config.algo].make_agent(config.agent, env.observation_size, env.action_size)
+
+
+def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:
+    """Training of one member as pure functions; `env` takes the place of the named environment."""
+    env = env or envs.make(config.env, config.physics)
+    store = replay.uniform(config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
+    return train.make_trainer(make_agent(config, env), env, store, config.train)
+
+
+def make_train(config: Config, env: Environment | None = None) -> Callable[..., tuple[train.TrainState, train.History]]:
+    """A whole run of one member, `train(key, scalars=None) -> (state, history)`, for `jax.jit(jax.vmap(train))(keys)`."""
+    return train.make_train(make_trainer(config, env), config.train)

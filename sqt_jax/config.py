@@ -1,0 +1,165 @@
+"""Every setting, its default and its limits (defaults: the paper's protocol).
+
+A setting is checked here once, for the library and the command line alike, before anything is compiled.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+from sqt_jax.types import Scalars
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be. `setting` is its name (the command line's flag without the dashes)."""
+
+    def __init__(self, setting: str, message: str):
+        super().__init__(f"--{setting}: {message}")
+        self.setting = setting
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentConfig:
+    """What an agent is made of: sizes and choices (static), and the start values of the traced `Scalars`."""
+
+    # The target (DESIGN: paper eqs. 4, 8, 18-20).
+    penalty: str = "none"  # none | batch_std (SQT, eq. 20) | transition_std (SQT-tuple, eq. 19)
+    penalty_coef: float = 0.0  # the paper's alpha
+    ddof: int = 1  # of the std over critics; 1 is torch's default, which the authors' released code uses
+    penalty_inside_gamma: bool = True
+    reduce: str = "min"  # min | mean | subset_min (REDQ)
+    subset_size: int = 2  # critics drawn per update by subset_min
+    # Networks.
+    ensemble_size: int = 2  # N
+    hidden: tuple[int, ...] = (256, 256)
+    # Optimisation.
+    lr: float = 3e-4
+    gamma: float = 0.99
+    tau: float = 0.005
+    policy_delay: int = 1  # critic updates per actor update
+    actor_reduce: str = "mean"  # mean | min | first: what the actor maximises of the N critics
+    # TD3's noises, in units of the action.
+    exploration_noise: float = 0.1
+    target_noise: float = 0.2
+    target_noise_clip: float = 0.5
+    # SAC's temperature.
+    temperature: float = 0.2
+    learn_temperature: bool = False
+
+    def scalars(self) -> Scalars:
+        return Scalars(**{name: getattr(self, name) for name in Scalars._fields})
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How an agent is trained. Steps are environment steps (transitions) of one member."""
+
+    steps: int = 1_000_000
+    warmup_steps: int = 25_000  # uniform random actions, no updates
+    batch_size: int = 256
+    replay_capacity: int = 1_000_000
+    num_envs: int = 1  # E: environments in lockstep per member
+    updates_per_step: int = 1  # UTD: updates per transition
+    eval_every: int = 5_000
+    eval_episodes: int = 10
+
+    @property
+    def capacity(self) -> int:
+        """Rows of the replay: no more than the run can fill, and a multiple of `num_envs`."""
+        return min(self.replay_capacity, self.steps) // self.num_envs * self.num_envs
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One member's whole experiment, but for its seed."""
+
+    algo: str
+    env: str
+    physics: str = "mjx"
+    agent: AgentConfig = AgentConfig()
+    train: TrainConfig = TrainConfig()
+
+    def flat(self) -> dict[str, Any]:
+        """All settings by name, without nesting: what `config.json` holds and `make_config` takes back."""
+        own = {"algo": self.algo, "env": self.env, "physics": self.physics}
+        return own | dataclasses.asdict(self.agent) | dataclasses.asdict(self.train)
+
+
+CHOICES = {
+    "penalty": ("none", "batch_std", "transition_std"),
+    "reduce": ("min", "mean", "subset_min"),
+    "actor_reduce": ("mean", "min", "first"),
+}
+
+# Limits of numbers, as (lowest, highest, what the setting takes).
+LIMITS: dict[str, tuple[float, float, str]] = {
+    "penalty_coef": (0, math.inf, "a number of at least 0"),
+    "ddof": (0, math.inf, "a whole number of at least 0"),
+    "subset_size": (1, math.inf, "a whole number of at least 1"),
+    "ensemble_size": (1, 1000, "a whole number from 1 to 1000"),
+    "lr": (0, 1, "a number from 0 to 1"),
+    "gamma": (0, 1, "a number from 0 to 1"),
+    "tau": (0, 1, "a number from 0 to 1"),
+    "policy_delay": (1, math.inf, "a whole number of at least 1"),
+    "exploration_noise": (0, math.inf, "a number of at least 0"),
+    "target_noise": (0, math.inf, "a number of at least 0"),
+    "target_noise_clip": (0, math.inf, "a number of at least 0"),
+    "temperature": (0, math.inf, "a number of at least 0"),
+    "steps": (1, 2**31 - 1, "a whole number from 1 to 2147483647"),
+    "warmup_steps": (0, math.inf, "a whole number of at least 0"),
+    "batch_size": (1, math.inf, "a whole number of at least 1"),
+    "replay_capacity": (1, 2**31 - 1, "a whole number from 1 to 2147483647"),
+    "num_envs": (1, math.inf, "a whole number of at least 1"),
+    "updates_per_step": (1, math.inf, "a whole number of at least 1"),
+    "eval_every": (1, math.inf, "a whole number of at least 1"),
+    "eval_episodes": (1, math.inf, "a whole number of at least 1"),
+}
+
+
+def check_value(setting: str, value: Any) -> None:
+    """Raises ConfigError where `value` alone, whatever the other settings are, cannot be."""
+    if setting in CHOICES and value not in CHOICES[setting]:
+        raise ConfigError(setting, f"takes one of {', '.join(CHOICES[setting])}, not {value!r}")
+    if setting in LIMITS:
+        low, high, takes = LIMITS[setting]
+        kinds = (int,) if "whole" in takes else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high or math.isinf(value):
+            raise ConfigError(setting, f"takes {takes}, not {value!r}")
+    if setting == "hidden" and not (value and all(isinstance(w, int) and 1 <= w <= 65536 for w in value)):
+        raise ConfigError(setting, f"takes layer widths, whole numbers from 1 to 65536 as in 256,256, not {value!r}")
+
+
+def check(config: Config) -> None:
+    """Raises ConfigError where settings cannot be, alone or together."""
+    for name, value in config.flat().items():
+        check_value(name, value)
+    agent, train = config.agent, config.train
+
+    def refuse(wrong: bool, setting: str, message: str) -> None:
+        if wrong:
+            raise ConfigError(setting, message)
+
+    n = agent.ensemble_size
+    if agent.penalty == "none":
+        message = f"takes 0 for {config.algo}, which has no penalty (its _sqt and _sqt_tuple forms have one)"
+        refuse(agent.penalty_coef > 0, "penalty_coef", message)
+    else:
+        refuse(n < 2, "ensemble_size", f"takes at least 2 for {config.algo}: one critic alone has no disagreement")
+        refuse(agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
+    if agent.reduce == "subset_min":
+        refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
+    refuse(agent.learn_temperature and agent.temperature <= 0, "temperature", "takes a positive start where it is learned")
+    refuse(
+        train.warmup_steps >= train.steps,
+        "warmup_steps",
+        f"takes fewer than the run's steps ({train.steps}), not {train.warmup_steps}: nothing would be learned",
+    )
+    refuse(
+        train.batch_size > train.capacity,
+        "batch_size",
+        f"takes at most the replay's capacity ({train.capacity}), not {train.batch_size}",
+    )
+    for name in ("steps", "warmup_steps", "eval_every"):
+        value = getattr(train, name)
+        message = f"takes a multiple of num_envs ({train.num_envs}), not {value}"
+        refuse(value % train.num_envs != 0, name, message)

@@ -1,0 +1,107 @@
+"""Actors and critics. Parameters are `{layer: {kernel [in, out], bias [out]}}`; critics have a leading axis N."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from sqt_jax.types import Array
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+def uniform_fan_in(bound: float):
+    """Initialiser of U(-bound, bound)."""
+
+    def init(key, shape, dtype=jnp.float32):
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+class Dense(nn.Module):
+    """A linear layer started as torch starts its own, U(±1/sqrt(fan_in)): what the papers' codes train from."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        init = uniform_fan_in(x.shape[-1] ** -0.5)
+        kernel = self.param("kernel", init, (x.shape[-1], self.features))
+        bias = self.param("bias", init, (self.features,))
+        return x @ kernel + bias
+
+
+def hidden_layers(x: Array, hidden: Sequence[int]) -> Array:
+    """ReLU layers `layer0`, `layer1`, ... of the calling module."""
+    for i, width in enumerate(hidden):
+        x = nn.relu(Dense(width, name=f"layer{i}")(x))
+    return x
+
+
+class TanhActor(nn.Module):
+    """TD3's deterministic policy: obs [B, O] -> action [B, A] in (-1, 1)."""
+
+    action_size: int
+    hidden: Sequence[int]
+
+    @nn.compact
+    def __call__(self, obs: Array) -> Array:
+        x = hidden_layers(obs, self.hidden)
+        return jnp.tanh(Dense(self.action_size, name=f"layer{len(self.hidden)}")(x))
+
+
+class Gaussian(NamedTuple):
+    """A diagonal Gaussian whose samples are squashed by tanh."""
+
+    mean: Array  # [B, A]
+    log_std: Array  # [B, A]
+
+    def mode(self) -> Array:
+        return jnp.tanh(self.mean)
+
+    def sample(self, eps: Array) -> tuple[Array, Array]:
+        """Action [B, A] and its log-probability [B] for the standard-normal draw `eps [B, A]`.
+
+        The tanh correction log(1 - tanh(u)²) is written 2 (log 2 - u - softplus(-2u)), which does not underflow
+        (SAC, https://arxiv.org/abs/1801.01290, appendix C).
+        """
+        u = self.mean + jnp.exp(self.log_std) * eps
+        log_prob = -0.5 * eps**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
+        correction = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
+        return jnp.tanh(u), jnp.sum(log_prob - correction, axis=-1)
+
+
+class GaussianActor(nn.Module):
+    """SAC's policy: obs [B, O] -> the Gaussian before tanh."""
+
+    action_size: int
+    hidden: Sequence[int]
+
+    @nn.compact
+    def __call__(self, obs: Array) -> Gaussian:
+        x = hidden_layers(obs, self.hidden)
+        mean = Dense(self.action_size, name="mean")(x)
+        log_std = Dense(self.action_size, name="log_std")(x)
+        return Gaussian(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+
+
+class Critic(nn.Module):
+    """One Q function: obs [B, O], action [B, A] -> [B]."""
+
+    hidden: Sequence[int]
+
+    @nn.compact
+    def __call__(self, obs: Array, action: Array) -> Array:
+        x = hidden_layers(jnp.concatenate([obs, action], axis=-1), self.hidden)
+        return Dense(1, name=f"layer{len(self.hidden)}")(x)[..., 0]
+
+
+def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> nn.Module:
+    """N independent critics as one module: obs [B, O], action [B, A] -> [N, B]."""
+    ensemble = nn.vmap(
+        Critic, in_axes=None, out_axes=0, axis_size=ensemble_size, variable_axes={"params": 0}, split_rngs={"params": True}
+    )
+    return ensemble(hidden)

@@ -1,0 +1,120 @@
+"""The conservative Q-target of SQT ("std Q-target"), usable alone inside any ensemble actor-critic.
+
+    bootstrap_value = reduce_i Q_i(s', a') - entropy_term - penalty
+    td_target       = reward + gamma * discount * bootstrap_value
+    penalty         = coef * mean_b std_i Q_i(s'_b, a'_b)      SQT        (paper eq. 20: one scalar per batch)
+                    = coef * std_i Q_i(s', a')                 SQT-tuple  (paper eq. 19: one value per transition)
+
+Everything takes the whole batch, `next_q [N, B]` of the N *target* critics at (s', a'): SQT's penalty is a mean over
+the batch. The variants are functions of `next_q` to be bound with `functools.partial`:
+
+    penalty = functools.partial(q_targets.batch_std, coef=0.5)
+    y = q_targets.td_target(reward, discount, next_q, gamma=0.99, penalty=penalty)
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from sqt_jax.types import Array
+
+Reduction = Callable[[Array], Array]  # next_q [N, B] -> [B]
+Penalty = Callable[[Array], Array]  # next_q [N, B] -> [B] or []
+
+
+def min_over_critics(next_q: Array) -> Array:
+    """Clipped double Q for N = 2 (TD3, https://arxiv.org/abs/1802.09477), MaxMin for more. [N, B] -> [B]"""
+    return jnp.min(next_q, axis=0)
+
+
+def mean_over_critics(next_q: Array) -> Array:
+    """[N, B] -> [B]"""
+    return jnp.mean(next_q, axis=0)
+
+
+def min_over_subset(next_q: Array, subset: Array) -> Array:
+    """The minimum over the critics of `subset [M]` (REDQ, https://arxiv.org/abs/2101.05982). [N, B] -> [B]"""
+    return jnp.min(next_q[subset], axis=0)
+
+
+def random_subset(key: Array, ensemble_size: int, subset_size: int) -> Array:
+    """Indices [M] of `subset_size` different critics out of `ensemble_size`, each subset equally likely."""
+    return jax.random.permutation(key, ensemble_size)[:subset_size]
+
+
+def std_over_critics(next_q: Array, ddof: int = 1) -> Array:
+    """The disagreement of the ensemble, [N, B] -> [B].
+
+    `ddof=1` divides by N - 1 as torch's `std` does (and the authors' released code with it).
+
+    Raises:
+      ValueError: fewer than two critics (nothing can disagree) or `ddof` not below N.
+    """
+    ensemble_size = next_q.shape[0]
+    if ensemble_size < 2:
+        raise ValueError("a penalty needs at least 2 critics: one alone has no disagreement")
+    if not 0 <= ddof < ensemble_size:
+        raise ValueError(f"ddof must be at least 0 and below the number of critics ({ensemble_size}), not {ddof}")
+    return jnp.std(next_q, axis=0, ddof=ddof)
+
+
+def no_penalty(next_q: Array) -> Array:
+    """The plain algorithm: []"""
+    return jnp.zeros((), next_q.dtype)
+
+
+def batch_std(next_q: Array, *, coef: Array | float, ddof: int = 1, axis_name: str | None = None) -> Array:
+    """SQT's penalty (eq. 20), one scalar for the batch: [N, B] -> []
+
+    `axis_name` names the mapped axis over which a batch is split, if it is.
+    """
+    disagreement = jnp.mean(std_over_critics(next_q, ddof))
+    if axis_name is not None:
+        disagreement = jax.lax.pmean(disagreement, axis_name)
+    return coef * disagreement
+
+
+def transition_std(next_q: Array, *, coef: Array | float, ddof: int = 1) -> Array:
+    """SQT-tuple's penalty (eq. 19), one value per transition: [N, B] -> [B]"""
+    return coef * std_over_critics(next_q, ddof)
+
+
+def td_target(
+    reward: Array,
+    discount: Array,
+    next_q: Array,
+    *,
+    gamma: Array | float,
+    reduce: Reduction = min_over_critics,
+    penalty: Penalty = no_penalty,
+    entropy_term: Array | float = 0.0,
+    value_bounds: tuple[Array, Array] | None = None,
+    penalty_inside_gamma: bool = True,
+) -> Array:
+    """The TD target of all variants, without gradient.
+
+    Args:
+      reward: [B].
+      discount: [B], 0 where the episode terminated, else 1.
+      next_q: [N, B], the target critics at (s', a').
+      gamma: discount factor.
+      reduce: how N values become one.
+      penalty: how the ensemble's disagreement is subtracted.
+      entropy_term: [B], SAC's temperature * log pi(a'|s'), subtracted.
+      value_bounds: (low, high) between which the reduced value is clipped, before anything is subtracted (TD7).
+      penalty_inside_gamma: discounted and masked with the value (eqs. 19, 20); else subtracted outside, from every
+        target, terminal ones too (as eqs. 4 and 8 are printed).
+
+    Returns:
+      [B].
+    """
+    value = reduce(next_q)
+    if value_bounds is not None:
+        value = jnp.clip(value, *value_bounds)
+    value = value - entropy_term
+    if penalty_inside_gamma:
+        target = reward + gamma * discount * (value - penalty(next_q))
+    else:
+        target = reward + gamma * discount * value - penalty(next_q)
+    return jax.lax.stop_gradient(target)

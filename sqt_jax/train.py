@@ -1,0 +1,217 @@
+"""The training program: one train loop for all algorithms, and its vmap over the members of a sweep.
+
+A `Trainer` holds pure functions of one member. A `Sweep` is the same over S members, compiled: parameters, replay
+storage, environments and keys get a member axis; the counters do not, so that conditions on them stay real branches
+under `vmap` (a batched predicate would turn both branches into computed-and-selected ones).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sqt_jax import rollout
+from sqt_jax.config import TrainConfig
+from sqt_jax.evaluate import Evaluation, evaluate
+from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep
+
+# Leaves that are equal in all members, which advance in lockstep.
+SHARED_LEAVES = frozenset({"env_steps", "gradient_steps", "pointer", "size"})
+
+
+TRAINING, EVALUATION = 0, 1  # what a member's key is folded with, so that the two streams never meet
+
+
+class TrainState(NamedTuple):
+    agent: State
+    timestep: TimeStep  # [E, ...]
+    episodes: rollout.Episodes
+    replay: State
+    key: Array  # the member's own; every draw folds a counter into it
+    env_steps: Array  # [] int32: transitions so far
+
+
+class Trainer(NamedTuple):
+    """Training of one member."""
+
+    init: Callable[..., TrainState]  # (key, scalars=None) -> state
+    advance: Callable[[TrainState, Any, Any], tuple[TrainState, Metrics]]  # (state, num_steps, learn)
+    evaluate: Callable[[TrainState], Evaluation]
+
+
+class Sweep(NamedTuple):
+    """Training of S members in lockstep: the functions of `Trainer` with a leading [S], jit-compiled."""
+
+    init: Callable[[Array, Scalars], TrainState]  # (keys [S], scalars of [S] each)
+    advance: Callable[[TrainState, int, bool], tuple[TrainState, Metrics]]  # donates the state
+    evaluate: Callable[[TrainState], Evaluation]
+
+
+class _Mean(NamedTuple):
+    """Running means of metrics; a NaN is a value that was not measured."""
+
+    total: Metrics
+    count: Metrics
+
+    @classmethod
+    def start(cls, like: Metrics) -> "_Mean":
+        return cls(jax.tree.map(lambda x: jnp.zeros(x.shape), like), jax.tree.map(lambda x: jnp.zeros(x.shape), like))
+
+    def add(self, metrics: Metrics) -> "_Mean":
+        total = jax.tree.map(lambda t, x: t + jnp.where(jnp.isnan(x), 0.0, x), self.total, metrics)
+        return _Mean(total, jax.tree.map(lambda c, x: c + ~jnp.isnan(x), self.count, metrics))
+
+    def result(self) -> Metrics:
+        return jax.tree.map(lambda t, c: t / c, self.total, self.count)  # 0 / 0 = NaN: never measured
+
+
+def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainConfig) -> Trainer:
+    """Joins an agent, an environment and a replay buffer into the training of one member."""
+    num_envs = config.num_envs
+    updates = num_envs * config.updates_per_step  # per lockstep step, so that UTD is per transition
+
+    def init(key: Array, scalars: Scalars | None = None) -> TrainState:
+        agent_key, env_key, own_key = jax.random.split(key, 3)
+        return TrainState(
+            agent=agent.init(agent_key, scalars),
+            timestep=rollout.reset(env, env_key, num_envs),
+            episodes=rollout.Episodes.start(num_envs),
+            replay=replay.init(),
+            key=own_key,
+            env_steps=jnp.zeros((), jnp.int32),
+        )
+
+    def key_for(purpose: int, state: TrainState) -> Array:
+        """A key that is used at this step of this member for this purpose only."""
+        return jax.random.fold_in(jax.random.fold_in(state.key, purpose), state.env_steps)
+
+    def step(state: TrainState, mean: _Mean, learn: Array) -> tuple[TrainState, _Mean]:
+        act_key, warmup_key, update_key = jax.random.split(key_for(TRAINING, state), 3)
+
+        def behaviour(obs):
+            uniform = rollout.uniform_actions(warmup_key, num_envs, env.action_size)
+            return jnp.where(learn, agent.act(state.agent, obs, act_key), uniform)
+
+        timestep, transition = rollout.step(env, state.timestep, behaviour)
+        replay_state = replay.insert(state.replay, transition)
+
+        def update(i, carry):
+            agent_state, mean = carry
+            sample_key, noise_key = jax.random.split(jax.random.fold_in(update_key, i))
+            batch = replay.sample(replay_state, sample_key)
+            agent_state, _, metrics = agent.update(agent_state, batch, noise_key)
+            return agent_state, mean.add(metrics)
+
+        # No updates in the warm-up: a loop of no iterations, so that warm-up and training are one compiled program.
+        agent_state, mean = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, (state.agent, mean))
+        episodes = state.episodes.add(transition.reward, timestep.terminated | timestep.truncated)
+        env_steps = state.env_steps + num_envs
+        return TrainState(agent_state, timestep, episodes, replay_state, state.key, env_steps), mean
+
+    def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> tuple[TrainState, Metrics]:
+        """`num_steps` lockstep steps, each of E transitions; without `learn`, random actions and no updates.
+
+        Both may be traced. The metrics are means over the call; NaN where nothing was measured.
+        """
+        sampled = jax.eval_shape(replay.sample, state.replay, state.key)
+        mean = _Mean.start(jax.eval_shape(agent.update, state.agent, sampled, state.key)[2])
+        state = state._replace(episodes=state.episodes.forget_ended())
+        learn = jnp.asarray(learn)
+        state, mean = jax.lax.fori_loop(0, num_steps, lambda _, carry: step(*carry, learn), (state, mean))
+        episodes = state.episodes
+        return state, mean.result() | {
+            "train_return": episodes.ended_return / episodes.ended,
+            "train_length": episodes.ended_length / episodes.ended,
+            "train_episodes": episodes.ended,
+        }
+
+    def evaluate_policy(state: TrainState) -> Evaluation:
+        """Deterministic episodes from starts that training never saw, new ones at each evaluation."""
+        key = key_for(EVALUATION, state)
+
+        def policy(obs):
+            return agent.act(state.agent, obs, key, deterministic=True)
+
+        return evaluate(env, policy, key, config.eval_episodes)
+
+    return Trainer(init, advance, evaluate_policy)
+
+
+def member_axes(state: TrainState) -> TrainState:
+    """For each leaf of a state: 0 where members have their own, None where they share it."""
+
+    def axis(path, _):
+        name = getattr(path[-1], "name", None)
+        return None if name in SHARED_LEAVES else 0
+
+    return jax.tree_util.tree_map_with_path(axis, state)
+
+
+def make_sweep(trainer: Trainer) -> Sweep:
+    """Compiles a trainer over members; each function compiles once, whatever the number of steps."""
+    example = jax.eval_shape(trainer.init, jax.random.key(0))
+    axes = member_axes(example)
+    return Sweep(
+        init=jax.jit(jax.vmap(trainer.init, out_axes=axes)),
+        advance=jax.jit(
+            jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=(axes, 0)), donate_argnums=0
+        ),
+        evaluate=jax.jit(jax.vmap(trainer.evaluate, in_axes=(axes,))),
+    )
+
+
+def evaluation_steps(config: TrainConfig) -> list[int]:
+    """Environment steps at which a run evaluates: 0, every `eval_every`, and the end."""
+    return [*range(0, config.steps, config.eval_every), config.steps]
+
+
+def segments(start: int, stop: int, config: TrainConfig) -> list[tuple[int, bool]]:
+    """What lies between two environment steps, as (lockstep steps, learn): warm-up first, then training."""
+    boundary = min(max(start, config.warmup_steps), stop)
+    parts = [((boundary - start) // config.num_envs, False), ((stop - boundary) // config.num_envs, True)]
+    return [(count, learn) for count, learn in parts if count]
+
+
+class History(NamedTuple):
+    """What a whole training run gives, a row per evaluation."""
+
+    env_steps: Array  # [evaluations]
+    returns: Array  # [evaluations, episodes]
+    lengths: Array  # [evaluations, episodes]
+    metrics: Metrics  # [evaluations] each, means since the previous evaluation
+
+
+def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[TrainState, History]]:
+    """One member's whole run as one pure function `train(key, scalars=None)`, for `jax.jit(jax.vmap(train))`."""
+    stops = evaluation_steps(config)
+    # Rows of two phases (warm-up, training), either of which may be empty.
+    counts = []
+    for start, stop in zip(stops, stops[1:], strict=False):
+        parts = {learn: count for count, learn in segments(start, stop, config)}
+        counts.append([parts.get(False, 0), parts.get(True, 0)])
+
+    def train(key: Array, scalars: Scalars | None = None) -> tuple[TrainState, History]:
+        def phase(state, count_and_learn):
+            return trainer.advance(state, *count_and_learn)
+
+        def interval(state, count):
+            state, metrics = jax.lax.scan(phase, state, (count, jnp.array([False, True])))
+            last = jnp.where(count[1] > 0, 1, 0)  # the phase that the interval ends in
+            return state, (state.env_steps, trainer.evaluate(state), jax.tree.map(lambda m: m[last], metrics))
+
+        state = trainer.init(key, scalars)
+        first = trainer.evaluate(state)
+        state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, state, jnp.array(counts))
+
+        def join(first, rest):
+            return jnp.concatenate([first[None], rest])
+
+        return state, History(
+            env_steps=join(jnp.zeros((), jnp.int32), env_steps),
+            returns=join(first.returns, evaluations.returns),
+            lengths=join(first.lengths, evaluations.lengths),
+            metrics=jax.tree.map(lambda m: join(jnp.full((), jnp.nan), m), metrics),
+        )
+
+    return train

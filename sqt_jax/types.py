@@ -1,0 +1,98 @@
+"""The few shapes of data that pass between modules.
+
+Letters in shapes: `S` members of a sweep, `E` environments per member, `N` critics, `B` batch, `O` observation,
+`A` action; axis order `[S, N, B, ...]`. An interchangeable part (agent, replay, environment) is a NamedTuple of pure
+functions over an explicit state, in the manner of `optax.GradientTransformation`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+Array = jax.Array
+Params = Any  # a pytree of arrays
+State = Any  # a pytree of arrays that only its owner looks into
+Metrics = dict[str, Array]  # scalars by name
+
+
+class Transition(NamedTuple):
+    """One environment step, or a batch of them with leading axes.
+
+    `discount` is 0 where the episode terminated and 1 elsewhere (also where it was truncated: the value of
+    `next_obs` is then bootstrapped); the discount factor itself is the setting `gamma`. `next_obs` is the true next
+    observation, never the first one of the following episode.
+    """
+
+    obs: Array  # [..., O]
+    action: Array  # [..., A], in [-1, 1]
+    reward: Array  # [...]
+    next_obs: Array  # [..., O]
+    discount: Array  # [...], 0 or 1
+
+
+class TimeStep(NamedTuple):
+    """What an environment gives after `reset` or `step`.
+
+    When an episode ends (`terminated` or `truncated`), `obs` is already the first observation of the next episode,
+    `final_obs` the last one of the episode that ended. Elsewhere `final_obs` equals `obs`.
+    """
+
+    state: State  # physics, the episode's step counter and the key of the next start
+    obs: Array  # [O]
+    reward: Array  # []
+    terminated: Array  # [] bool: the task ended the episode; there is no value beyond
+    truncated: Array  # [] bool: the time limit ended it; the value beyond is bootstrapped
+    final_obs: Array  # [O]
+
+
+class Environment(NamedTuple):
+    """A task as pure functions of one environment; `vmap` gives many.
+
+    `step` takes actions in [-1, 1] and starts a new episode by itself, with a new random start each time.
+    """
+
+    name: str
+    observation_size: int
+    action_size: int
+    episode_length: int  # steps until truncation
+    reset: Callable[[Array], TimeStep]  # key -> first time step
+    step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
+    set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
+
+
+class Agent(NamedTuple):
+    """An algorithm as pure functions of one member; `vmap` gives a sweep.
+
+    `update(state, batch, key)` is `update_with_noise(state, batch, draw_noise(key, batch))`: every random number of
+    an update is in the `noise`, so that a test can pass its own.
+    """
+
+    init: Callable[..., State]  # (key, scalars=None) -> state
+    act: Callable[..., Array]  # (state, obs [B, O], key, deterministic=False) -> action [B, A]
+    update: Callable[[State, Transition, Array], tuple[State, Array, Metrics]]  # -> (state, td_error [B], metrics)
+    draw_noise: Callable[[Array, Transition], Any]  # (key, batch) -> noise
+    update_with_noise: Callable[[State, Transition, Any], tuple[State, Array, Metrics]]
+    td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]  # (state, batch, noise) -> [B], terms
+
+
+class Replay(NamedTuple):
+    """A store of transitions as pure functions of one member's state."""
+
+    init: Callable[[], State]
+    insert: Callable[[State, Transition], State]  # E new transitions at once
+    sample: Callable[[State, Array], Transition]  # (state, key) -> batch of B transitions
+
+
+class Scalars(NamedTuple):
+    """Settings that are traced, so that a sweep over their values compiles once."""
+
+    penalty_coef: Array | float
+    lr: Array | float
+    gamma: Array | float
+    tau: Array | float
+    temperature: Array | float  # SAC's; the start value where it is learned
+
+    def as_arrays(self) -> "Scalars":
+        return Scalars(*(jnp.asarray(value, jnp.float32) for value in self))

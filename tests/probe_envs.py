@@ -1,0 +1,48 @@
+"""Tiny environments with known Q-values, through the same wrapper as the real tasks."""
+
+import jax
+import jax.numpy as jnp
+
+from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.types import Environment
+
+
+def one_step() -> Environment:
+    """Every episode is one step; the reward is obs - (action - obs)², so Q*(obs, obs) = obs and the best action is obs."""
+
+    def start(key):
+        obs = jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)
+        return obs, obs
+
+    def advance(state, action):
+        reward = state[0] - (action[0] - state[0]) ** 2
+        return state, state, reward, jnp.ones((), bool)
+
+    return make_environment("one_step", 1, 1, 10, start, advance)
+
+
+def constant_reward(episode_length: int = 5) -> Environment:
+    """Reward 1 for ever; episodes end by the time limit alone, so Q = 1 / (1 - gamma) everywhere."""
+
+    def start(key):
+        obs = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
+        return obs, obs
+
+    def advance(state, action):
+        return state, state, jnp.ones(()), jnp.zeros((), bool)
+
+    return make_environment("constant_reward", 2, 1, episode_length, start, advance)
+
+
+def countdown(length: int = 3) -> Environment:
+    """Reward 1 a step, terminated after `length` steps: Q = 1 + gamma + ... over the steps left."""
+
+    def start(key):
+        del key
+        return jnp.zeros(()), jnp.zeros((1,))
+
+    def advance(state, action):
+        state = state + 1
+        return state, state[None], jnp.ones(()), state >= length
+
+    return make_environment("countdown", 1, 1, 100, start, advance)
