@@ -5,13 +5,16 @@ A variant is a row: a base algorithm and the settings in which it differs.
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
+
+import jax
 
 from sqt_jax import envs, replay, train
 from sqt_jax.agents import sac, td3
 from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check
-from sqt_jax.types import Agent, Environment
+from sqt_jax.types import Agent, Environment, Replay
 
 
 class Algorithm(NamedTuple):
@@ -77,13 +80,31 @@ def make_agent(config: Config, env: Environment) -> Agent:
     return ALGORITHMS[config.algo].make_agent(config.agent, env.observation_size, env.action_size)
 
 
+def make_replay(config: Config, env: Environment) -> Replay:
+    """The replay buffer of a configuration, for an environment's sizes."""
+    return replay.uniform(config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
+
+
 def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:
     """Training of one member as pure functions; `env` takes the place of the named environment."""
     env = env or envs.make(config.env, config.physics)
-    store = replay.uniform(config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
-    return train.make_trainer(make_agent(config, env), env, store, config.train)
+    return train.make_trainer(make_agent(config, env), env, make_replay(config, env), config.train)
 
 
 def make_train(config: Config, env: Environment | None = None) -> Callable[..., tuple[train.TrainState, train.History]]:
     """A whole run of one member, `train(key, scalars=None) -> (state, history)`, for `jax.jit(jax.vmap(train))(keys)`."""
     return train.make_train(make_trainer(config, env), config.train)
+
+
+def memory_estimate(config: Config, num_members: int, env: Environment | None = None) -> int:
+    """Bytes that a sweep of `num_members` holds on the device: the replay, and each agent twice (an update's room)."""
+    env = env or envs.make(config.env, config.physics)
+
+    def size(function: Callable, *args: Any) -> int:
+        return sum(
+            math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(jax.eval_shape(function, *args))
+        )
+
+    return num_members * (
+        size(make_replay(config, env).init) + 2 * size(make_agent(config, env).init, jax.random.key(0))
+    )

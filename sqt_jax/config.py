@@ -148,7 +148,9 @@ def check(config: Config) -> None:
         refuse(agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
     if agent.reduce == "subset_min":
         refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
-    refuse(agent.learn_temperature and agent.temperature <= 0, "temperature", "takes a positive start where it is learned")
+    refuse(
+        agent.learn_temperature and agent.temperature <= 0, "temperature", "takes a positive start where it is learned"
+    )
     refuse(
         train.warmup_steps >= train.steps,
         "warmup_steps",

@@ -102,6 +102,11 @@ class Critic(nn.Module):
 def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> nn.Module:
     """N independent critics as one module: obs [B, O], action [B, A] -> [N, B]."""
     ensemble = nn.vmap(
-        Critic, in_axes=None, out_axes=0, axis_size=ensemble_size, variable_axes={"params": 0}, split_rngs={"params": True}
+        Critic,
+        in_axes=None,
+        out_axes=0,
+        axis_size=ensemble_size,
+        variable_axes={"params": 0},
+        split_rngs={"params": True},
     )
     return ensemble(hidden)

@@ -154,9 +154,7 @@ def make_sweep(trainer: Trainer) -> Sweep:
     axes = member_axes(example)
     return Sweep(
         init=jax.jit(jax.vmap(trainer.init, out_axes=axes)),
-        advance=jax.jit(
-            jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=(axes, 0)), donate_argnums=0
-        ),
+        advance=jax.jit(jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=(axes, 0)), donate_argnums=0),
         evaluate=jax.jit(jax.vmap(trainer.evaluate, in_axes=(axes,))),
     )
 

@@ -63,7 +63,13 @@ def td_target(
 
 
 def update(
-    apply: Callable[..., Array], config: AgentConfig, params: Params, opt_state, batch: Transition, target: Array, lr: Array
+    apply: Callable[..., Array],
+    config: AgentConfig,
+    params: Params,
+    opt_state,
+    batch: Transition,
+    target: Array,
+    lr: Array,
 ) -> tuple[Params, object, Array, Metrics]:
     """One Adam step of all critics towards `target [B]`.
 

@@ -83,7 +83,11 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         critic, critic_opt, td_error, metrics = critics.update(
             critic_net.apply, config, state.critic, state.critic_opt, batch, target, state.scalars.lr
         )
-        return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics | {"penalty": jnp.mean(terms["penalty"])}
+        return (
+            state._replace(critic=critic, critic_opt=critic_opt),
+            td_error,
+            metrics | {"penalty": jnp.mean(terms["penalty"])},
+        )
 
     def update_actor(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Metrics]:
         def loss_fn(actor):

@@ -75,7 +75,11 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         critic, critic_opt, td_error, metrics = critics.update(
             critic_net.apply, config, state.critic, state.critic_opt, batch, target, state.scalars.lr
         )
-        return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics | {"penalty": jnp.mean(terms["penalty"])}
+        return (
+            state._replace(critic=critic, critic_opt=critic_opt),
+            td_error,
+            metrics | {"penalty": jnp.mean(terms["penalty"])},
+        )
 
     def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
         def loss_fn(actor):

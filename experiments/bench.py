@@ -1,0 +1,248 @@
+"""Throughput of each part: `python -m experiments.bench --suites=env,update,loop --members=1,5`.
+
+Each figure is the median over `--repeats` timed calls of a compiled loop that runs for about `--seconds`, after a
+first call that compiles. The suites of one process run one after the other; compare figures of one run only, since a
+machine's speed changes with what else it does.
+"""
+
+import dataclasses
+import functools
+import json
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from absl import app, flags
+from rich.console import Console
+from rich.table import Table
+
+from sqt_jax import algorithms, envs, replay, rollout, train
+from sqt_jax.types import Array, Transition
+
+SUITES = ("env", "update", "replay", "loop")
+FLAGS = flags.FLAGS
+flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
+flags.DEFINE_list("tasks", list(envs.TASKS), "Tasks of the suites env and loop; the first one's sizes for the others.")
+flags.DEFINE_list("algos", ["td3", "sac"], "Algorithms of the suites update and loop.")
+flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
+flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
+flags.DEFINE_integer("repeats", 5, "Timed calls per figure; the median counts.", lower_bound=1)
+flags.DEFINE_float("seconds", 1.0, "About how long one timed call runs.", lower_bound=0.0)
+flags.DEFINE_string("json", "", "Also write the rows to this file.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One figure. `rate` counts the unit in all members together, per second."""
+
+    suite: str
+    what: str
+    members: int
+    unit: str
+    rate: float
+    compile_seconds: float
+
+
+def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
+    """Iterations per second of `run(iterations)` (median), and the seconds of the first call, which compiles."""
+
+    def timed(iterations: int) -> float:
+        start = time.perf_counter()
+        jax.block_until_ready(run(iterations))
+        return time.perf_counter() - start
+
+    compile_seconds = timed(1)
+    iterations = 1
+    while (elapsed := timed(iterations)) < seconds / 4:
+        iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
+    iterations = max(1, round(iterations * seconds / elapsed))
+    return statistics.median(iterations / timed(iterations) for _ in range(repeats)), compile_seconds
+
+
+def member_keys(members: int) -> Array:
+    return jax.vmap(jax.random.key)(jnp.arange(members))
+
+
+def bench_env(task: str, members: int, **timing: Any) -> Row:
+    """Environment steps with random actions, automatic restarts included."""
+    env = envs.make(task)
+
+    def step(timestep, key):
+        def policy(_):
+            return rollout.uniform_actions(key, 1, env.action_size)
+
+        return rollout.step(env, timestep, policy)[0]
+
+    @jax.jit
+    def run(timestep, keys, steps):
+        def body(i, timestep):
+            return jax.vmap(step)(timestep, jax.vmap(jax.random.fold_in, (0, None))(keys, i))
+
+        return jax.lax.fori_loop(0, steps, body, timestep)
+
+    keys = member_keys(members)
+    start = jax.jit(jax.vmap(lambda key: rollout.reset(env, key, 1)))(keys)
+    rate, compile_seconds = measure(lambda steps: run(start, keys, steps), **timing)
+    return Row("env", task, members, "env steps", rate * members, compile_seconds)
+
+
+def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
+    """Updates on one fixed batch: the learner alone, without environment and replay."""
+    config = algorithms.make_config(algo, task)
+    env = envs.make(task)
+    agent = algorithms.make_agent(config, env)
+    size = config.train.batch_size
+
+    def random_batch(key):
+        obs, action, reward, next_obs = (
+            jax.random.normal(k, shape)
+            for k, shape in zip(
+                jax.random.split(key, 4),
+                [(size, env.observation_size), (size, env.action_size), (size,), (size, env.observation_size)],
+                strict=True,
+            )
+        )
+        return Transition(obs, jnp.tanh(action), reward, next_obs, jnp.ones(size))
+
+    example = jax.eval_shape(agent.init, jax.random.key(0))
+    axes = train.member_axes(example)
+    update = jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0))
+
+    @jax.jit
+    def run(state, batch, keys, steps):
+        def body(i, state):
+            return update(state, batch, jax.vmap(jax.random.fold_in, (0, None))(keys, i))[0]
+
+        return jax.lax.fori_loop(0, steps, body, state)
+
+    keys = member_keys(members)
+    state, batch = jax.jit(jax.vmap(agent.init, out_axes=axes))(keys), jax.vmap(random_batch)(keys)
+    rate, compile_seconds = measure(lambda steps: run(state, batch, keys, steps), **timing)
+    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds)
+
+
+def bench_replay(what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
+    """One insert of a row, or one sampled batch, on a full buffer."""
+    env = envs.make(task)
+    store = replay.uniform(capacity, 256, env.observation_size, env.action_size)
+    axes = train.member_axes(jax.eval_shape(store.init))
+    obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
+
+    def insert(carry, _):
+        state, total = carry
+        return store.insert(state, Transition(obs, action, scalar, obs, scalar)), total
+
+    def sample(carry, key):
+        state, total = carry
+        return state, total + jnp.sum(store.sample(state, key).obs)
+
+    step = jax.vmap({"insert": insert, "sample": sample}[what], in_axes=((axes, 0), 0), out_axes=(axes, 0))
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def run(carry, keys, steps):
+        return jax.lax.fori_loop(
+            0, steps, lambda i, c: step(c, jax.vmap(jax.random.fold_in, (0, None))(keys, i)), carry
+        )
+
+    keys = member_keys(members)
+    full = jax.jit(jax.vmap(lambda _: store.init()._replace(size=jnp.int32(capacity)), out_axes=axes))(keys)
+    carry = (full, jnp.zeros(members))
+
+    def once(steps):
+        nonlocal carry
+        carry = run(carry, keys, steps)
+        return carry
+
+    rate, compile_seconds = measure(once, **timing)
+    return Row(
+        "replay", f"{what}, {task} rows, capacity {capacity:,}", members, f"{what}s", rate * members, compile_seconds
+    )
+
+
+def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
+    """The whole training loop: environment step, insert, sample, update."""
+    config = algorithms.make_config(algo, task, replay_capacity=100_000)
+    sweep = train.make_sweep(algorithms.make_trainer(config))
+    scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
+    state = sweep.init(member_keys(members), scalars)
+    state, _ = sweep.advance(state, 300, False)
+
+    def once(steps):
+        nonlocal state
+        state, metrics = sweep.advance(state, steps, True)
+        return metrics
+
+    rate, _ = measure(once, **timing)
+    start = time.perf_counter()  # `advance` has run before: compile it once more, for the figure
+    sweep.advance.lower(state, 1, True).compile()  # type: ignore[attr-defined]
+    compile_seconds = time.perf_counter() - start
+    return Row("loop", f"{algo} on {task}", members, "env steps", rate * members, compile_seconds)
+
+
+def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
+    tasks, algos = FLAGS.tasks, FLAGS.algos
+    members = [int(value) for value in FLAGS.members]
+    for suite in suites:
+        for count in members:
+            if suite == "env":
+                yield from (bench_env(task, count, **timing) for task in tasks)
+            elif suite == "update":
+                yield from (bench_update(algo, tasks[0], count, **timing) for algo in algos)
+            elif suite == "replay":
+                yield from (
+                    bench_replay(what, tasks[0], int(size), count, **timing)
+                    for what in ("insert", "sample")
+                    for size in FLAGS.capacities
+                )
+            elif suite == "loop":
+                yield from (bench_loop(algo, task, count, **timing) for algo in algos for task in tasks)
+
+
+def machine() -> dict[str, Any]:
+    """What the figures depend on."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        cpu = f"{len(names)} x {names[0]}" if names else cpu
+    device = jax.devices()[0]
+    return {"cpu": cpu, "device": f"{device.platform}: {device.device_kind}", "jax": jax.__version__}
+
+
+def markdown(all_rows: Sequence[Row]) -> str:
+    lines = ["| suite | what | members | rate | unit | compile s |", "|---|---|---|---|---|---|"]
+    for r in all_rows:
+        lines.append(f"| {r.suite} | {r.what} | {r.members} | {r.rate:,.0f} | {r.unit}/s | {r.compile_seconds:.1f} |")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str]) -> None:
+    del argv
+    unknown = [suite for suite in FLAGS.suites if suite not in SUITES]
+    if unknown:
+        sys.exit(f"--suites: takes some of {', '.join(SUITES)}, not {unknown[0]!r}")
+    console = Console()
+    console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
+    found = []
+    for row in rows(FLAGS.suites, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
+        found.append(row)
+        console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
+    table = Table("suite", "what", "members", "rate", "unit", "compile s", title="median of repeats")
+    for r in found:
+        cells = (str(r.members), f"{r.rate:,.0f}", f"{r.unit}/s", f"{r.compile_seconds:.1f}")
+        table.add_row(r.suite, r.what, *cells)
+    console.print(table)
+    print(markdown(found))
+    if FLAGS.json:
+        report = {"machine": machine(), "rows": [dataclasses.asdict(row) for row in found]}
+        Path(FLAGS.json).write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    app.run(main)

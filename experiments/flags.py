@@ -1,0 +1,315 @@
+"""The command line's flags: one per setting of `sqt_jax.config`, and a few of the run's own.
+
+A flag that is not given is absent from the result: defaults belong to the algorithms. What is checked here needs
+nothing but the text of the command line, so that a typing error is answered before any heavy import; the limits of
+the settings are `sqt_jax.algorithms.make_config`'s.
+"""
+
+import dataclasses
+import difflib
+import math
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from absl import flags as absl_flags
+
+from experiments.presets import PRESETS
+from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check_value
+from sqt_jax.types import Scalars
+
+EXAMPLE = "python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4"
+DEFAULT_SEEDS = (0, 1, 2, 3, 4)
+MAX_SEED = 2**32 - 1
+
+# What each setting is, for --help: a new field of the configuration becomes a flag by itself and wants a line here.
+SETTING_HELP = {
+    "physics": "what computes the environment's physics",
+    "steps": "environment steps per member",
+    "warmup_steps": "first steps, with uniform random actions and no updates",
+    "batch_size": "transitions per update",
+    "replay_capacity": "transitions kept per member",
+    "num_envs": "environments in lockstep per member",
+    "updates_per_step": "updates per transition",
+    "eval_every": "environment steps between evaluations",
+    "eval_episodes": "episodes per evaluation",
+    "penalty_coef": "weight of the disagreement penalty, the paper's alpha",
+    "ddof": "the std over critics divides by N - ddof",
+    "penalty_inside_gamma": "discount and mask the penalty with the bootstrapped value",
+    "reduce": "critics to one target value: min, mean or subset_min (REDQ)",
+    "subset_size": "critics drawn per update by --reduce=subset_min",
+    "ensemble_size": "number of critics",
+    "hidden": "widths of the hidden layers",
+    "lr": "Adam's learning rate",
+    "gamma": "discount factor",
+    "tau": "step of the target networks",
+    "policy_delay": "critic updates per actor update",
+    "actor_reduce": "what the actor maximises of the critics: mean, min or first",
+    "exploration_noise": "TD3: std of the noise on actions",
+    "target_noise": "TD3: std of the noise on target actions",
+    "target_noise_clip": "TD3: limit of that noise",
+    "temperature": "SAC: weight of the entropy; 'auto' learns it",
+}
+# Chosen by --algo and by --temperature=auto, or not a setting of its own.
+NOT_FLAGS = ("penalty", "learn_temperature", "algo", "env", "agent", "train")
+# Where the algorithms' own defaults differ from the dataclass's.
+DEFAULT_TEXT = {
+    "penalty_coef": "0.5 with _sqt, 0.1 with _sqt_tuple",
+    "policy_delay": "2 for td3, 1 for sac",
+}
+
+
+class Options(NamedTuple):
+    """A parsed command line. Only what was given is in `settings` and `sweep`."""
+
+    algo: str
+    env: str
+    seeds: tuple[int, ...]
+    settings: dict[str, Any]  # one value for all members
+    sweep: dict[str, tuple[float, ...]]  # scalars with several values, in the order of `Scalars`
+    preset: str
+    out: str
+    name: str | None
+    tensorboard: bool
+    quiet: bool
+
+
+class UsageError(ValueError):
+    """A command line that cannot be. The text is one line that names the flag."""
+
+
+class _Flag(NamedTuple):
+    name: str
+    parse: Callable[[str], Any] | None  # None: a switch
+    takes: str
+    help: str
+    default: str
+
+
+def _integer(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        value = float(text)  # 1e6
+        if not value.is_integer():
+            raise ValueError from None
+        return int(value)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError
+    return value
+
+
+def _list_of(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    def parse_list(text: str) -> tuple[Any, ...]:
+        return tuple(parse(item.strip()) for item in text.split(","))
+
+    return parse_list
+
+
+def _numbers_or_auto(text: str) -> tuple[float, ...] | str:
+    return "auto" if text.strip() == "auto" else _list_of(_number)(text)
+
+
+def _setting_flag(field: dataclasses.Field) -> _Flag:
+    """The flag of one field of the configuration, by the type of its default."""
+    default = str(field.default)
+    parse: Callable[[str], Any] | None
+    if field.name == "temperature":
+        parse, takes = _numbers_or_auto, "a number, a list like 0.1,0.2, or auto"
+    elif field.name in Scalars._fields:
+        parse, takes = _list_of(_number), "a number, or a list like 0.1,0.5"
+    elif isinstance(field.default, bool):
+        parse, takes, default = None, "true or false", default.lower()
+    elif isinstance(field.default, int):
+        parse, takes = _integer, "a whole number"
+    elif isinstance(field.default, float):
+        parse, takes = _number, "a number"
+    elif isinstance(field.default, tuple):
+        parse, takes, default = _list_of(_integer), "whole numbers like 256,256", ",".join(map(str, field.default))
+    else:
+        parse, takes = str, "a word"
+    return _Flag(field.name, parse, takes, SETTING_HELP.get(field.name, ""), DEFAULT_TEXT.get(field.name, default))
+
+
+def _settings(config: type) -> list[_Flag]:
+    return [_setting_flag(field) for field in dataclasses.fields(config) if field.name not in NOT_FLAGS]
+
+
+FLAGS: dict[str, list[_Flag]] = {
+    "What to run": [
+        _Flag("algo", str, "a name", "algorithm: td3 or sac, alone or with _sqt or _sqt_tuple", "required"),
+        _Flag("env", str, "a name", "environment: cheetah, walker, ant or humanoid", "required"),
+        *_settings(Config),
+        _Flag(
+            "seeds",
+            _list_of(_integer),
+            "whole numbers like 0,1,2",
+            "random seeds; each is one member per value of a list",
+            ",".join(map(str, DEFAULT_SEEDS)),
+        ),
+        _Flag("preset", str, f"one of {', '.join(PRESETS)}", "bundle of settings; flags win over it", "paper"),
+    ],
+    "Training": _settings(TrainConfig),
+    "Algorithm (the scalars " + ", ".join(Scalars._fields) + " take lists)": _settings(AgentConfig),
+    "Output": [
+        _Flag("out", str, "a folder", "results go to OUT/ENV/ALGO/NAME/", "runs"),
+        _Flag("name", str, "a word", "name of the run", "settings that differ from the defaults, and the time"),
+        _Flag("tensorboard", None, "true or false", "also write TensorBoard events", "true"),
+        _Flag("quiet", None, "true or false", "print errors only", "false"),
+        _Flag("help", None, "true or false", "this text", ""),
+    ],
+}
+
+
+class _Parser(absl_flags.ArgumentParser):
+    def __init__(self, flag: _Flag):
+        self.flag = flag
+        self.syntactic_help = flag.takes
+
+    def parse(self, argument: str) -> Any:
+        assert self.flag.parse is not None
+        try:
+            return self.flag.parse(argument)
+        except (ValueError, OverflowError):
+            raise ValueError(f"takes {self.flag.takes}") from None
+
+
+def _values(argv: Sequence[str]) -> dict[str, Any]:
+    """The flags that were given, parsed by type."""
+    # Own flag values: the libraries define flags of theirs in the global ones.
+    values = absl_flags.FlagValues()
+    values.set_gnu_getopt(True)
+    known = [flag for group in FLAGS.values() for flag in group]
+    for flag in known:
+        if flag.parse is None:
+            absl_flags.DEFINE_boolean(flag.name, None, flag.help, flag_values=values)
+        else:
+            absl_flags.DEFINE(_Parser(flag), flag.name, None, flag.help, flag_values=values)
+    try:
+        rest = values(list(argv), known_only=False)[1:]
+    except absl_flags.UnrecognizedFlagError as error:
+        close = difflib.get_close_matches(error.flagname, [flag.name for flag in known], n=1)
+        hint = f"; did you mean --{close[0]}?" if close else "; --help lists the flags"
+        raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
+    except (absl_flags.Error, ValueError) as error:
+        text = str(error).removeprefix("flag ").removeprefix("ERROR:: ")
+        text = re.sub(r"\('Non-boolean argument to boolean flag', .*\)", "takes true or false", text)
+        missing = re.fullmatch(r"Missing value for flag -*(\w+)", text)
+        if missing:
+            takes = next(flag.takes for flag in known if flag.name == missing[1])
+            text = f"--{missing[1]}: takes {takes}"
+        raise UsageError(text) from None
+    if rest:
+        raise UsageError(f"{rest[0]}: unexpected argument; settings are given as --flag=value")
+    return {flag.name: values[flag.name].value for flag in known if values[flag.name].present}
+
+
+def parse(argv: Sequence[str]) -> Options | None:
+    """A command line (program name first) as `Options`; None where it asks for help.
+
+    Raises `UsageError` for everything the text alone gives away.
+    """
+    given = argv[1 : argv.index("--")] if "--" in argv else argv[1:]
+    if any(word in ("--help", "-help", "--h", "-h", "-?") for word in given):
+        return None
+    values = _values(argv)
+    own = {name: values.pop(name, None) for name in ("algo", "env", "seeds", "preset", "out", "name")}
+    for required in ("algo", "env"):
+        if not own[required]:
+            raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
+
+    preset = own["preset"] or "paper"
+    if preset not in PRESETS:
+        raise UsageError(f"--preset={preset}: takes one of {', '.join(PRESETS)}")
+
+    name = own["name"]
+    if name is not None and (
+        name in ("", ".", "..") or set(name) & set("/\\") or not name.isprintable() or len(name.encode()) > 200
+    ):
+        raise UsageError(f"--name={name[:40]}: takes up to 200 bytes without slashes: it becomes a folder's name")
+    if own["out"] == "":
+        raise UsageError("--out=: takes a folder")
+
+    settings: dict[str, Any] = {}
+    sweep: dict[str, tuple[float, ...]] = {}
+    tensorboard, quiet = values.pop("tensorboard", True), values.pop("quiet", False)
+    if values.get("temperature") == "auto":
+        del values["temperature"]
+        settings["learn_temperature"] = True
+    for setting, value in values.items():
+        choices = value if setting in Scalars._fields else (value,)
+        try:
+            for choice in choices:
+                check_value(setting, choice)
+        except ConfigError as error:
+            raise UsageError(str(error)) from None
+        _refuse_duplicates(setting, choices)
+        if len(choices) > 1:
+            sweep[setting] = choices
+        else:
+            settings[setting] = choices[0]
+    sweep = {scalar: sweep[scalar] for scalar in Scalars._fields if scalar in sweep}
+    return Options(
+        algo=own["algo"],
+        env=own["env"],
+        seeds=_check_seeds(own["seeds"] if own["seeds"] is not None else DEFAULT_SEEDS),
+        settings=settings,
+        sweep=sweep,
+        preset=preset,
+        out=own["out"] or "runs",
+        name=name,
+        tensorboard=tensorboard,
+        quiet=quiet,
+    )
+
+
+def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
+    for seed in seeds:
+        if not 0 <= seed <= MAX_SEED:
+            raise UsageError(f"--seeds={seed}: takes whole numbers from 0 to {MAX_SEED}")
+    _refuse_duplicates("seeds", seeds)
+    return seeds
+
+
+def _refuse_duplicates(name: str, values: Sequence[Any]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise UsageError(f"--{name}: takes each value once, {value} is there {values.count(value)} times")
+
+
+def help_text() -> str:
+    """What --help prints."""
+    lines = [
+        "Train an ensemble actor-critic with or without SQT, several seeds and settings at once.",
+        "",
+        f"  {EXAMPLE}",
+        "  python -m experiments.run --algo=td3_sqt --env=cheetah --seeds=0,1 --penalty_coef=0.1,0.5 --preset=quick",
+    ]
+    for group, rows in FLAGS.items():
+        lines += ["", f"{group}:"]
+        for flag in rows:
+            default = f" ({flag.default})" if flag.default else ""
+            head = f"  --{flag.name}" if flag.parse is None else f"  --{flag.name}={_metavar(flag)}"
+            body = textwrap.wrap(flag.help + default, width=78)
+            lines.append(f"{head:<30} {body[0]}")
+            lines += [f"{'':<30} {more}" for more in body[1:]]
+    lines += [
+        "",
+        "In brackets: the default. A switch is turned off by --noNAME. A setting with a list is swept: the members of",
+        "the run are all its values times the seeds. Exit codes: 0 done, 2 bad usage, 3 a member diverged,",
+        "130 interrupted.",
+    ]
+    return "\n".join(lines)
+
+
+def _metavar(flag: _Flag) -> str:
+    if flag.name == "temperature":
+        return "X[,X...]|auto"
+    if flag.takes.startswith("a number, "):
+        return "X[,X...]"
+    return {"a number": "X", "a whole number": "N"}.get(flag.takes, "N,N..." if "numbers" in flag.takes else "NAME")

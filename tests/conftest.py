@@ -1,0 +1,36 @@
+"""What all tests share: the cache of compiled programs, hypothesis' profile, strict promotion."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# Before JAX is imported, and through the environment, so that processes started by tests share the cache.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+# No deadline: the first example of a property compiles it. Derandomised: a run is repeatable.
+hypothesis.settings.register_profile("sqt_jax", deadline=None, max_examples=40, derandomize=True)
+hypothesis.settings.load_profile("sqt_jax")
+
+
+@pytest.fixture(scope="module")
+def strict_dtypes() -> Iterator[None]:
+    """No implicit promotion between dtypes: an accidental float64 or int32 becomes an error.
+
+    For tests of this repository's own arithmetic (`pytestmark = pytest.mark.usefixtures("strict_dtypes")`); MJX does
+    not bear it.
+    """
+    with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@pytest.fixture(params=["eager", "jit"])
+def maybe_jit(request):
+    """A transformation that hand-worked numbers must not depend on: none, then `jax.jit`."""
+    return jax.jit if request.param == "jit" else lambda function: function

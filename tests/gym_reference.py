@@ -1,0 +1,92 @@
+"""What Gymnasium's own environments do from recorded states, and what ours do: computed once for all tests.
+
+MJX takes long to compile, so there is one compiled step per task here, of `COUNT` environments.
+"""
+
+import warnings
+from functools import cache
+from typing import NamedTuple
+
+import gymnasium
+import jax
+import mujoco
+import numpy as np
+
+from sqt_jax import envs
+from sqt_jax.envs import TASKS
+from sqt_jax.types import Environment, TimeStep
+
+COUNT = 64
+
+
+class Recorded(NamedTuple):
+    """One control step of MuJoCo C in float64 from `COUNT` states of random rollouts, solver not warm-started."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    action: np.ndarray  # in [-1, 1]
+    first_obs: np.ndarray
+    obs: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    next_qvel: np.ndarray
+
+
+def gymnasium_environment(name: str) -> gymnasium.Env:
+    mujoco.set_mju_user_warning(lambda message: None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = gymnasium.make(TASKS[name].gymnasium_id).unwrapped
+    mujoco.set_mju_user_warning(None)
+    return env
+
+
+@cache
+def recorded(name: str) -> Recorded:
+    """Evenly spaced states of a random rollout, and up to eight whose next step terminates the episode."""
+    env = gymnasium_environment(name)
+    generator = np.random.default_rng(0)
+    scale = env.model.actuator_ctrlrange[:, 1]
+    states, last = [], []
+    env.reset(seed=0)
+    for _ in range(6 * COUNT):
+        action = generator.uniform(-1, 1, env.model.nu).astype(np.float32)
+        state = (env.data.qpos.copy(), env.data.qvel.copy(), action)
+        if env.step(action * scale)[2]:
+            last.append(state)
+            env.reset()
+        else:
+            states.append(state)
+    last = last[:8]
+    spread = np.linspace(0, len(states) - 1, COUNT - len(last)).astype(int)
+    rows = []
+    for qpos, qvel, action in last + [states[i] for i in spread]:
+        mujoco.mj_resetData(env.model, env.data)
+        env.set_state(qpos, qvel)
+        first_obs = env._get_obs()
+        obs, reward, terminated, *_ = env.step(action * scale)
+        rows.append((qpos, qvel, action, first_obs, obs, reward, terminated, env.data.qvel.copy()))
+    return Recorded(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+@cache
+def environment(name: str) -> Environment:
+    return envs.make(name)
+
+
+@cache
+def compiled_reset(name: str):
+    return jax.jit(jax.vmap(environment(name).reset))
+
+
+@cache
+def compiled_step(name: str):
+    return jax.jit(jax.vmap(environment(name).step))
+
+
+@cache
+def ours(name: str) -> tuple[TimeStep, TimeStep]:
+    """The recorded states in our environment, and one step from them."""
+    rows = recorded(name)
+    first = jax.jit(jax.vmap(environment(name).set_physics))(rows.qpos, rows.qvel)
+    return first, compiled_step(name)(first, rows.action)

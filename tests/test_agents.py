@@ -1,0 +1,441 @@
+"""What every row of the table of algorithms promises: shapes, laws, clocks and members."""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sqt_jax.agents import td3
+from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.config import AgentConfig
+from sqt_jax.train import member_axes
+from sqt_jax.types import Agent, Scalars, Transition
+
+O, A, B = 3, 2, 16  # noqa: E741
+KEY = jax.random.key(0)
+VARIANTS = [name for name in ALGORITHMS if "_sqt" in name]
+PLAIN = [name for name in ALGORITHMS if "_sqt" not in name]
+BASES_WITH_SOFT_TARGETS = [name for name in PLAIN if name in ("td3", "sac")]
+
+every_algorithm = pytest.mark.parametrize("algo", ALGORITHMS)
+every_base = pytest.mark.parametrize("algo", PLAIN)
+every_variant = pytest.mark.parametrize("algo", VARIANTS)
+
+
+def base_of(algo):
+    return algo.split("_sqt")[0]
+
+
+def make_batch(seed, size=B) -> Transition:
+    generator = np.random.default_rng(seed)
+    obs, next_obs = generator.normal(size=(2, size, O))
+    action, discount = generator.uniform(-1, 1, size=(size, A)), generator.random(size) < 0.8
+    fields = (obs, action, generator.normal(size=size), next_obs, discount)
+    return Transition(*(jnp.asarray(field, jnp.float32) for field in fields))
+
+
+class Subject(NamedTuple):
+    """An agent of a small size, and its functions compiled once for all tests."""
+
+    config: AgentConfig
+    agent: Agent
+    update: jax.stages.Wrapped
+    act: jax.stages.Wrapped
+
+
+@cache
+def subject(algo, **changes) -> Subject:
+    config = AgentConfig(**({"hidden": (8,)} | ALGORITHMS[algo].settings | changes))
+    agent = ALGORITHMS[algo].make_agent(config, O, A)
+    return Subject(config, agent, jax.jit(agent.update), jax.jit(agent.act, static_argnames="deterministic"))
+
+
+@cache
+def compiled_init(base):
+    """Variants start as their base does (tested below), so that a base's start is compiled once for all."""
+    return jax.jit(subject(base).agent.init)
+
+
+def start(algo, seed=0, scalars=None, **changes):
+    """A first state. Any number of critics is gathered out of starts with two each, which saves compilations."""
+    config, agent, *_ = subject(algo, **changes)
+    scalars = (scalars or config.scalars()).as_arrays()
+    starts = [compiled_init(base_of(algo))(jax.random.key(seed + 1000 * i), scalars) for i in range(3)]
+    n = config.ensemble_size
+
+    def gather(like, *leaves):
+        return leaves[0] if leaves[0].shape == like.shape else jnp.concatenate(leaves)[:n]
+
+    return jax.tree.map(gather, jax.eval_shape(agent.init, KEY), *starts)
+
+
+def run(algo, state, steps, **changes):
+    """The states and metrics after each of a few updates."""
+    states, metrics = [state], []
+    for k in range(steps):
+        state, _, measured = subject(algo, **changes).update(state, make_batch(k), jax.random.key(100 + k))
+        states.append(state)
+        metrics.append(measured)
+    return states, metrics
+
+
+def numbers(tree):
+    """A tree's leaves but typed keys, as numpy arrays."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+    return [np.asarray(leaf) for leaf in leaves]
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(numbers(a), numbers(b), strict=True))
+
+
+def assert_close(a, b, **tolerance):
+    for x, y in zip(numbers(a), numbers(b), strict=True):
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+def learned(state):
+    """A state without the scalars, in which a plain algorithm and its variants differ."""
+    return state._replace(scalars=None)
+
+
+# Shapes and soundness
+
+
+@every_variant
+def test_a_variant_starts_exactly_as_its_base(algo):
+    scalars = subject(algo).config.scalars()
+    ours, plain = (jax.make_jaxpr(subject(name).agent.init)(KEY, scalars) for name in (algo, base_of(algo)))
+    assert str(ours) == str(plain)
+
+
+SIZES = [(algo, n) for algo in ALGORITHMS for n in (1, 2, 5) if n > 1 or algo in PLAIN]
+
+
+@pytest.mark.parametrize(("algo", "n"), SIZES)
+def test_three_updates_are_finite_and_have_these_shapes(algo, n):
+    changes = {} if n == 2 else {"ensemble_size": n}
+    state = start(algo, **changes)
+    update = subject(algo, **changes).update
+    measured = []
+    for k in range(3):
+        before = state
+        state, td_error, metrics = update(state, make_batch(k), jax.random.key(k))
+        measured.append(metrics)
+        assert td_error.shape == (B,) and np.all(np.asarray(td_error) >= 0)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(lambda x: (x.shape, x.dtype), before)
+    assert all(np.all(np.isfinite(leaf)) for leaf in numbers(state))
+    assert all(leaf.shape[0] == n for leaf in jax.tree.leaves(state.critic))
+    assert state.gradient_steps == 3
+    expected = {"critic_loss", "q_mean", "q_std", "td_error", "td_target", "penalty", "actor_loss"}
+    for metrics in measured:
+        assert expected <= set(metrics) and all(value.shape == () for value in metrics.values())
+        assert np.isnan(metrics["q_std"]) == (n == 1)  # one critic has no disagreement to report
+        assert (metrics["penalty"] > 0) == (algo in VARIANTS)
+    finite = [{name for name, value in metrics.items() if np.isfinite(value)} for metrics in measured]
+    assert set.union(*finite) >= expected - ({"q_std"} if n == 1 else set())
+
+
+@every_algorithm
+def test_dtypes_do_not_promote_by_accident(algo):
+    """All but the optimizer's step, which is optax's."""
+    config, agent, _, _ = subject(algo)
+    state, batch = jax.eval_shape(agent.init, KEY), make_batch(0)
+    with jax.numpy_dtype_promotion("strict"):
+        noise = jax.eval_shape(agent.draw_noise, KEY, batch)
+        target, terms = jax.eval_shape(agent.td_target, state, batch, noise)
+        action = jax.eval_shape(agent.act, state, batch.obs, KEY)
+    assert target.shape == (B,) and target.dtype == action.dtype == jnp.float32
+    assert terms["penalty"].shape == ((B,) if config.penalty == "transition_std" else ())
+
+
+@every_algorithm
+def test_update_is_update_with_its_own_noise(algo):
+    """The same program, so that nothing needs to be compiled."""
+    agent = subject(algo).agent
+    arguments = jax.eval_shape(agent.init, KEY), make_batch(0), KEY
+
+    def with_noise(state, batch, key):
+        return agent.update_with_noise(state, batch, agent.draw_noise(key, batch))
+
+    assert str(jax.make_jaxpr(agent.update)(*arguments)) == str(jax.make_jaxpr(with_noise)(*arguments))
+
+
+@every_base
+def test_the_key_decides_the_noise(algo):
+    agent = subject(algo).agent
+    first, again, other = (agent.draw_noise(jax.random.key(seed), make_batch(0)) for seed in (0, 0, 1))
+    assert same(first, again) and not same(first, other)
+    drawn = [leaf for leaf in numbers(first) if leaf.shape == (B, A)]
+    assert len(np.unique(np.stack(drawn))) == len(drawn) * B * A  # no draw is used twice
+
+
+@every_base
+def test_the_seed_decides_the_start(algo):
+    assert same(start(algo, seed=3), start(algo, seed=3))
+    first, other = start(algo, seed=3), start(algo, seed=4)
+    for name in ("actor", "critic"):
+        pairs = zip(numbers(getattr(first, name)), numbers(getattr(other, name)), strict=True)
+        assert not any(np.array_equal(x, y) for x, y in pairs)
+    for name in first._fields:
+        if name.startswith("target_"):
+            assert same(getattr(first, name), getattr(first, name.removeprefix("target_")))
+
+
+# Acting
+
+
+@every_base
+def test_deterministic_actions_ignore_the_key(algo):
+    act, state, obs = subject(algo).act, start(algo), make_batch(0).obs
+    first, other = (act(state, obs, jax.random.key(seed), deterministic=True) for seed in (0, 1))
+    np.testing.assert_array_equal(first, other)
+    explored, again, differently = (act(state, obs, jax.random.key(seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(explored, again)
+    assert np.all(explored != differently) and np.all(explored != first)
+
+
+@every_base
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_actions_stay_within_their_limits(algo, deterministic):
+    obs = 1e4 * make_batch(0, size=512).obs
+    action = subject(algo).act(start(algo), obs, KEY, deterministic=deterministic)
+    assert action.shape == (512, A)
+    assert 0.99 < np.abs(action).max() <= 1
+
+
+def test_td3_explores_with_its_noise():
+    act, state, obs = subject("td3").act, start("td3"), jnp.zeros((4096, O))
+    noise = act(state, obs, KEY) - act(state, obs, KEY, deterministic=True)
+    assert abs(float(noise.mean())) < 0.005 and abs(float(noise.std()) - 0.1) < 0.005
+
+
+def test_td3_smooths_the_target_action_within_its_clip():
+    agent, state, batch = subject("td3").agent, start("td3"), make_batch(0)
+    draws = np.asarray(agent.draw_noise(KEY, make_batch(0, size=4096)).target_noise)
+    assert abs(draws.std() - 0.2) < 0.01
+
+    @jax.jit
+    def target(scale):
+        return agent.td_target(state, batch, td3.TD3Noise(jnp.full((B, A), scale), jnp.arange(2)))[0]
+
+    np.testing.assert_array_equal(target(0.5), target(0.9))
+    np.testing.assert_array_equal(target(-0.5), target(-0.9))
+    assert not np.array_equal(target(0.5), target(0.4))
+
+
+# The law of the coefficient
+
+
+@every_variant
+def test_coefficient_zero_is_the_plain_algorithm_bit_for_bit(algo):
+    plain, _ = run(base_of(algo), start(base_of(algo)), 4)
+    ours, _ = run(algo, start(algo, scalars=subject(algo).config.scalars()._replace(penalty_coef=0.0)), 4)
+    assert same(learned(ours[-1]), learned(plain[-1]))
+
+
+@every_variant
+def test_a_positive_coefficient_changes_target_and_training(algo):
+    assert subject(algo).config.penalty_coef > 0
+    plain, plain_metrics = run(base_of(algo), start(base_of(algo)), 4)
+    ours, metrics = run(algo, start(algo), 4)
+    # The first update starts from equal critics: the mean target differs by gamma * mean(discount * penalty) exactly.
+    assert metrics[0]["td_target"] < plain_metrics[0]["td_target"]
+    assert not same(ours[1].critic, plain[1].critic)
+    assert not same(ours[-1].actor, plain[-1].actor)
+
+
+@every_variant
+def test_the_target_is_the_plain_target_less_the_penalty(algo):
+    inside, outside = subject(algo).agent, subject(algo, penalty_inside_gamma=False).agent
+    plain, state, batch = subject(base_of(algo)).agent, start(algo), make_batch(0)
+
+    @jax.jit
+    def targets(state, batch):
+        noise = plain.draw_noise(KEY, batch)
+        return [agent.td_target(state, batch, noise) for agent in (plain, inside, outside)]
+
+    (theirs, _), (ours, terms), (ours_outside, terms_outside) = targets(state, batch)
+    penalty = np.broadcast_to(terms["penalty"], B)
+    assert np.all(penalty > 0) and same(terms["penalty"], terms_outside["penalty"])
+    np.testing.assert_allclose(theirs - ours, 0.99 * batch.discount * penalty, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(theirs - ours_outside, penalty, rtol=1e-3, atol=1e-6)
+
+
+# Clocks
+
+# Updates between two moves of the target networks, and whether they are soft steps.
+TARGET_PERIOD = {"td3": 2, "sac": 1, "td7": 250}
+
+
+@every_base
+def test_the_actor_and_the_targets_move_only_when_they_should(algo):
+    config = subject(algo).config
+    states, metrics = run(algo, start(algo), 4)
+    for k, (before, after) in enumerate(zip(states, states[1:], strict=False), start=1):
+        assert not same(before.critic, after.critic)
+        due = k % config.policy_delay == 0
+        assert same(before.actor, after.actor) == (not due)
+        assert np.isnan(metrics[k - 1]["actor_loss"]) == (not due)
+        targets = [name for name in before._fields if name.startswith("target_")]
+        assert "target_critic" in targets
+        for name in targets:
+            assert same(getattr(before, name), getattr(after, name)) == (k % TARGET_PERIOD[algo] != 0)
+
+
+@pytest.mark.parametrize("algo", BASES_WITH_SOFT_TARGETS)
+def test_targets_make_soft_steps_towards_the_updated_networks(algo):
+    scalars = subject(algo).config.scalars()._replace(tau=0.25)
+    states, _ = run(algo, start(algo, scalars=scalars), 4)
+    period = TARGET_PERIOD[algo]
+    for k in range(period, 5, period):
+        before, after = states[k - 1], states[k]
+        for name in [name for name in after._fields if name.startswith("target_")]:
+            online = getattr(after, name.removeprefix("target_"))
+            expected = jax.tree.map(lambda t, o: 0.75 * t + 0.25 * o, getattr(before, name), online)
+            assert_close(getattr(after, name), expected, rtol=1e-5, atol=1e-7)
+
+
+@every_base
+def test_the_delayed_actor_is_a_real_branch_also_over_members(algo):
+    agent = subject(algo).agent
+    axes = member_axes(jax.eval_shape(agent.init, KEY))
+    update = jax.vmap(agent.update, in_axes=(axes, None, 0), out_axes=(axes, 0, 0))
+    states = jax.eval_shape(jax.vmap(agent.init, out_axes=axes), jax.random.split(KEY, 3))
+    jaxpr = jax.make_jaxpr(update)(states, make_batch(0), jax.random.split(KEY, 3))
+    assert [equation for equation in jaxpr.eqns if equation.primitive.name == "cond"]
+
+
+@every_base
+def test_an_actor_step_raises_the_critics_mean_at_its_actions(algo):
+    scalars = subject(algo).config.scalars()._replace(temperature=0.0, lr=1e-2, tau=0.0)
+    state, one = start(algo, scalars=scalars), jnp.ones((), jnp.int32)  # after one update, all actors' are due
+    batch = make_batch(0)._replace(reward=jnp.zeros(B), discount=jnp.zeros(B))
+    update = subject(algo).update
+
+    def objective(state):
+        return -float(update(state._replace(gradient_steps=one), batch, KEY)[2]["actor_loss"])
+
+    frozen = state.critic
+    before, after = objective(state), state
+    for k in range(10):
+        after = update(after, batch, jax.random.key(k))[0]._replace(critic=frozen, gradient_steps=one)
+    assert same(after.critic, state.critic) and not same(after.actor, state.actor)
+    assert objective(after) > before
+
+
+# Members
+
+
+def over_members(function, axes, *states):
+    return jax.tree.map(function, axes, *states, is_leaf=lambda axis: axis is None)
+
+
+@every_algorithm
+def test_members_side_by_side_are_each_member_alone(algo):
+    agent, update = subject(algo).agent, subject(algo).update
+    default = subject(algo).config.scalars()
+    coefs = (0.0, 0.5, 1.0) if algo in VARIANTS else (0.0, 0.0, 0.0)
+    settings = [
+        default._replace(penalty_coef=coef, lr=lr, gamma=gamma, tau=tau, temperature=temperature)
+        for coef, lr, gamma, tau, temperature in zip(
+            coefs, (3e-4, 1e-3, 1e-2), (0.99, 0.9, 0.5), (0.005, 0.1, 0.5), (0.2, 0.1, 0.5), strict=True
+        )
+    ]
+    alone = [start(algo, seed, scalars) for seed, scalars in enumerate(settings)]
+    axes = member_axes(jax.eval_shape(agent.init, KEY))
+    together = over_members(lambda axis, *leaves: leaves[0] if axis is None else jnp.stack(leaves), axes, *alone)
+    update_all = jax.jit(jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0)))
+    for k in range(4):
+        batches = [make_batch(10 * k + i) for i in range(3)]
+        keys = jax.random.split(jax.random.key(k), 3)
+        together, td_error, _ = update_all(together, jax.tree.map(lambda *leaves: jnp.stack(leaves), *batches), keys)
+        own = [update(state, batch, key) for state, batch, key in zip(alone, batches, keys, strict=True)]
+        alone = [state for state, _, _ in own]
+        for i in range(3):
+            np.testing.assert_allclose(td_error[i], own[i][1], rtol=1e-4, atol=1e-5)
+    for i in range(3):
+        member = over_members(lambda axis, leaf, i=i: leaf if axis is None else leaf[i], axes, together)
+        assert_close(member, alone[i], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", Scalars._fields)
+@every_algorithm
+def test_a_swept_scalar_shares_one_compilation_and_matters(algo, name):
+    update = subject(algo).update
+    default = subject(algo).config.scalars()
+    before = run(algo, start(algo), 2)[0][-1]
+    compilations = update._cache_size()
+    after = run(algo, start(algo, scalars=default._replace(**{name: 0.7 * getattr(default, name) + 0.05})), 2)[0][-1]
+    assert update._cache_size() == compilations == 1
+    unused = (name == "temperature" and base_of(algo) != "sac") or (name == "penalty_coef" and algo in PLAIN)
+    assert same(learned(after), learned(before)) == unused
+
+
+# SAC's temperature
+
+
+@pytest.fixture(scope="module")
+def learning_temperature():
+    """SAC with a learned temperature, and a start whose policy has a narrow or a wide standard deviation."""
+    own = subject("sac", learn_temperature=True)
+    first = jax.jit(lambda scalars: own.agent.init(KEY, scalars).log_temperature)  # of init, what depends on scalars
+
+    def make(log_std, temperature):
+        scalars = own.config.scalars()._replace(lr=1e-2, temperature=temperature).as_arrays()
+        state = start("sac", scalars=scalars)._replace(log_temperature=first(scalars))
+        layer = {"kernel": jnp.zeros((8, A)), "bias": jnp.full(A, log_std)}
+        return state._replace(actor={"params": state.actor["params"] | {"log_std": layer}})
+
+    return own, make
+
+
+@pytest.mark.parametrize(("log_std", "direction"), [(-3.0, 1), (0.0, -1)], ids=["narrow", "wide"])
+def test_a_learned_temperature_moves_towards_its_entropy_target(learning_temperature, log_std, direction):
+    own, make = learning_temperature
+    state = make(log_std, temperature=0.3)
+    seen = []
+    for k in range(5):
+        state, _, metrics = own.update(state, make_batch(k), jax.random.key(k))
+        assert (metrics["entropy"] < -A) == (direction > 0)  # the target is minus the number of actions
+        seen.append(float(metrics["temperature"]))
+    np.testing.assert_allclose(seen[0], 0.3, rtol=1e-6)  # the scalar is where learning starts
+    assert np.all(np.sign(np.diff(seen)) == direction)
+    assert np.all(np.isfinite(seen)) and min(seen) > 0
+
+
+def test_a_fixed_temperature_stays():
+    _, metrics = run("sac", start("sac"), 3)
+    np.testing.assert_array_equal([m["temperature"] for m in metrics], np.full(3, 0.2, np.float32))
+
+
+def test_the_temperature_weighs_the_entropy_in_the_target():
+    default, agent, *_ = subject("sac")
+    default, batch = default.scalars(), make_batch(0)
+    noise = agent.draw_noise(KEY, batch)
+    compute = jax.jit(agent.td_target)
+    (without, _), (with_it, terms) = (
+        compute(start("sac", scalars=default._replace(temperature=value)), batch, noise) for value in (0.0, 0.5)
+    )
+    expected = -0.99 * batch.discount * 0.5 * terms["next_log_prob"]
+    np.testing.assert_allclose(with_it - without, expected, rtol=1e-4, atol=1e-5)
+
+
+# Reductions
+
+
+@every_base
+def test_a_random_subset_of_critics_makes_the_target(algo):
+    changes = {"ensemble_size": 5, "reduce": "subset_min", "subset_size": 2}
+    agent, state, batch = subject(algo, **changes).agent, start(algo, ensemble_size=5), make_batch(0)
+    noise = agent.draw_noise(KEY, batch)
+    assert noise.subset.shape == (2,) and len(set(noise.subset.tolist())) == 2
+    compute = jax.jit(agent.td_target)
+    indices = [(i, j) for i in range(5) for j in range(i, 5)]
+    pairs = {pair: compute(state, batch, noise._replace(subset=jnp.array(pair)))[0] for pair in indices}
+    for (i, j), target in pairs.items():
+        np.testing.assert_allclose(target, np.minimum(pairs[i, i], pairs[j, j]), rtol=1e-5, atol=1e-6)
+    assert not np.array_equal(pairs[0, 0], pairs[1, 1])

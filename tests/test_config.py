@@ -1,0 +1,207 @@
+"""Defaults, limits and their messages, and the way of a configuration through a file."""
+
+import json
+
+import pytest
+
+from sqt_jax.algorithms import ALGORITHMS, make_config
+from sqt_jax.config import CHOICES, LIMITS, AgentConfig, ConfigError, TrainConfig
+from sqt_jax.types import Scalars
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_defaults_are_the_papers_protocol(algo):
+    config = make_config(algo, "ant")
+    train, agent = config.train, config.agent
+    assert (config.algo, config.env, config.physics) == (algo, "ant", "mjx")
+    assert (train.steps, train.warmup_steps, train.eval_every, train.eval_episodes) == (1_000_000, 25_000, 5_000, 10)
+    assert (train.batch_size, train.replay_capacity, train.num_envs, train.updates_per_step) == (256, 1_000_000, 1, 1)
+    assert (agent.lr, agent.gamma, agent.hidden) == (3e-4, 0.99, (256, 256))
+    assert (agent.ddof, agent.penalty_inside_gamma, agent.actor_reduce) == (1, True, "mean")
+    assert (agent.tau, agent.ensemble_size, agent.reduce) == (0.005, 2, "min")
+
+
+def test_defaults_of_td3s_noises_and_sacs_temperature():
+    td3, sac = make_config("td3", "ant").agent, make_config("sac", "ant").agent
+    assert (td3.exploration_noise, td3.target_noise, td3.target_noise_clip) == (0.1, 0.2, 0.5)
+    assert (td3.policy_delay, sac.policy_delay) == (2, 1)
+    assert (sac.temperature, sac.learn_temperature) == (0.2, False)
+
+
+REFUSED = [
+    ("penalty_coef", {"penalty_coef": -0.1}),
+    ("penalty_coef", {"penalty_coef": float("nan")}),
+    ("penalty_coef", {"penalty_coef": float("inf")}),
+    ("penalty_coef", {"penalty_coef": "0.5"}),
+    ("penalty_coef", {"penalty_coef": True}),
+    ("penalty", {"penalty": "std"}),
+    ("reduce", {"reduce": "max"}),
+    ("actor_reduce", {"actor_reduce": "second"}),
+    ("ddof", {"ddof": -1}),
+    ("ddof", {"ddof": 0.5}),
+    ("ddof", {"ddof": 2}),
+    ("ddof", {"ddof": 5, "ensemble_size": 5}),
+    ("ensemble_size", {"ensemble_size": 0}),
+    ("ensemble_size", {"ensemble_size": 2.0}),
+    ("ensemble_size", {"ensemble_size": 1}),
+    ("ensemble_size", {"ensemble_size": 1, "ddof": 0}),
+    ("ensemble_size", {"ensemble_size": 1001}),
+    ("subset_size", {"subset_size": 0}),
+    ("subset_size", {"reduce": "subset_min", "subset_size": 3}),
+    ("hidden", {"hidden": ()}),
+    ("hidden", {"hidden": (256, 0)}),
+    ("hidden", {"hidden": (256, 70_000)}),
+    ("hidden", {"hidden": (256.0,)}),
+    ("lr", {"lr": -1e-4}),
+    ("lr", {"lr": 3}),
+    ("gamma", {"gamma": 1.01}),
+    ("gamma", {"gamma": -0.1}),
+    ("gamma", {"gamma": None}),
+    ("tau", {"tau": 2.0}),
+    ("policy_delay", {"policy_delay": 0}),
+    ("exploration_noise", {"exploration_noise": -0.1}),
+    ("target_noise", {"target_noise": -0.2}),
+    ("target_noise_clip", {"target_noise_clip": -0.5}),
+    ("temperature", {"temperature": -0.2}),
+    ("temperature", {"temperature": 0.0, "learn_temperature": True}),
+    ("steps", {"steps": 0}),
+    ("steps", {"steps": 2**31}),
+    ("physics", {"physics": "bullet"}),
+    ("penalty_inside_gamma", {"penalty_inside_gamma": "no"}),
+    ("learn_temperature", {"learn_temperature": "no"}),
+    ("hidden", {"hidden": 256}),
+    ("hidden", {"hidden": (True,)}),
+    ("warmup_steps", {"warmup_steps": -1}),
+    ("warmup_steps", {"warmup_steps": 1_000_000}),
+    ("warmup_steps", {"steps": 25_000}),
+    ("batch_size", {"batch_size": 0}),
+    ("batch_size", {"replay_capacity": 255}),
+    ("batch_size", {"steps": 100, "warmup_steps": 10, "eval_every": 10}),
+    ("replay_capacity", {"replay_capacity": 0}),
+    ("num_envs", {"num_envs": 0}),
+    ("steps", {"num_envs": 3, "warmup_steps": 0, "eval_every": 3}),
+    ("warmup_steps", {"num_envs": 4, "warmup_steps": 1001}),
+    ("eval_every", {"num_envs": 4, "eval_every": 1002}),
+    ("updates_per_step", {"updates_per_step": 0}),
+    ("eval_every", {"eval_every": 0}),
+    ("eval_episodes", {"eval_episodes": 0}),
+]
+
+
+@pytest.mark.parametrize(("setting", "settings"), REFUSED, ids=str)
+def test_what_cannot_be_is_refused_by_its_name(setting, settings):
+    with pytest.raises(ConfigError) as error:
+        make_config("sac_sqt", "ant", **settings)
+    assert error.value.setting == setting
+    message = str(error.value)
+    assert message.startswith(f"--{setting}: takes ") and "\n" not in message
+
+
+def test_every_limited_setting_is_among_the_refused():
+    assert set(LIMITS) | set(CHOICES) <= {setting for setting, _ in REFUSED}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"penalty_coef": 0},  # an int where a number is taken
+        {"gamma": 1.0, "tau": 1.0, "temperature": 0.0, "warmup_steps": 0},
+        {"ddof": 0},
+        {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5},
+        {"num_envs": 8, "replay_capacity": 1_001},
+        {"steps": 256, "warmup_steps": 255, "eval_every": 1000},
+    ],
+    ids=str,
+)
+def test_the_edges_of_the_limits_are_taken(settings):
+    flat = make_config("sac_sqt", "ant", **settings).flat()
+    assert {name: flat[name] for name in settings} == settings
+
+
+def test_a_plain_algorithm_takes_no_penalty():
+    with pytest.raises(ConfigError, match="--penalty_coef: takes 0 for td3, .* _sqt and _sqt_tuple"):
+        make_config("td3", "ant", penalty_coef=0.5)
+    assert make_config("td3", "ant", penalty_coef=0).agent.penalty_coef == 0
+
+
+def test_a_plain_algorithms_ddof_is_that_of_the_disagreement_it_reports():
+    with pytest.raises(ConfigError, match="--ddof: takes a number below the ensemble_size .2."):
+        make_config("td3", "ant", ddof=2)
+
+
+def test_a_plain_algorithm_may_have_one_critic():
+    assert make_config("td3", "ant", ensemble_size=1).agent.ensemble_size == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "setting", "hint"),
+    [
+        ({"penalty_coeff": 0.5}, "penalty_coeff", "did you mean penalty_coef?"),
+        ({"warmup": 0}, "warmup", "did you mean warmup_steps?"),
+        ({"Gamma": 0.9}, "Gamma", "did you mean gamma?"),
+        ({"zzz": 1}, "zzz", "is not a setting"),
+        ({"algo": "sac_sqtt"}, "algo", "did you mean sac_sqt?"),
+        ({"algo": "ppo"}, "algo", "takes one of td3, td3_sqt, "),
+        ({"env": "humanoidd"}, "env", "did you mean 'humanoid'?"),
+    ],
+    ids=str,
+)
+def test_unknown_names_get_a_suggestion(settings, setting, hint):
+    with pytest.raises(ConfigError) as error:
+        make_config(**({"algo": "sac_sqt", "env": "ant"} | settings))
+    assert error.value.setting == setting
+    assert hint in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("alias", "name"),
+    [("half_cheetah", "cheetah"), ("halfcheetah", "cheetah"), ("walker2d", "walker"), ("humanoid", "humanoid")],
+)
+def test_aliases_are_resolved(alias, name):
+    assert make_config("td3", alias) == make_config("td3", name)
+    assert make_config("td3", alias).env == name
+
+
+CONFIGS = [
+    make_config("td3", "walker2d"),
+    make_config("sac_sqt_tuple", "humanoid", penalty_coef=0.3, hidden=(64,), num_envs=4, ensemble_size=5, ddof=0),
+    make_config("sac", "cheetah", learn_temperature=True, reduce="subset_min", steps=50_000),
+]
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.algo)
+def test_flat_settings_make_the_same_configuration(config):
+    assert make_config(**config.flat()) == config
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.algo)
+def test_flat_settings_survive_json(config):
+    assert make_config(**json.loads(json.dumps(config.flat()))) == config
+
+
+def test_no_setting_has_two_owners():
+    config = CONFIGS[0]
+    assert len(config.flat()) == 3 + len(AgentConfig.__dataclass_fields__) + len(TrainConfig.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("settings", "capacity"),
+    [
+        ({}, 1_000_000),
+        ({"steps": 30_000}, 30_000),
+        ({"replay_capacity": 2_000}, 2_000),
+        ({"replay_capacity": 2_001, "num_envs": 8}, 2_000),
+    ],
+    ids=str,
+)
+def test_the_replay_is_no_larger_than_the_run_and_whole_inserts_fit(settings, capacity):
+    assert make_config("td3", "ant", **settings).train.capacity == capacity
+
+
+def test_scalars_are_the_settings_of_their_names():
+    agent = make_config("sac_sqt", "ant", penalty_coef=0.25, lr=1e-3, gamma=0.9, tau=0.1, temperature=0.3).agent
+    expected = Scalars(penalty_coef=0.25, lr=1e-3, gamma=0.9, tau=0.1, temperature=0.3)
+    assert agent.scalars() == expected
+    arrays = agent.scalars().as_arrays()
+    assert all(value.shape == () and value.dtype == "float32" for value in arrays)
+    assert [round(float(value), 6) for value in arrays] == list(expected)

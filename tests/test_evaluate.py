@@ -1,0 +1,82 @@
+"""Evaluation: each episode to its own end, from fresh starts, under the given policy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from probe_envs import constant_reward, countdown, one_step
+
+from sqt_jax import rollout
+from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.evaluate import evaluate
+
+KEY = jax.random.key(0)
+
+
+def zeros(obs):
+    return jnp.zeros((obs.shape[0], 1))
+
+
+def run(env, policy=zeros, episodes=4, key=KEY):
+    return jax.jit(lambda key: evaluate(env, policy, key, episodes))(key)
+
+
+def random_lengths():
+    """Episodes of 1 to 6 steps, drawn at the start; the reward is the number of the step."""
+
+    def start(key):
+        length = jax.random.randint(key, (), 1, 7)
+        return (jnp.zeros((), jnp.int32), length), length[None].astype(jnp.float32)
+
+    def advance(state, action):
+        step, length = state[0] + 1, state[1]
+        return (step, length), length[None].astype(jnp.float32), step.astype(jnp.float32), step >= length
+
+    return make_environment("random_lengths", 1, 1, 100, start, advance)
+
+
+def test_terminated_episodes():
+    result = run(countdown(3))
+    np.testing.assert_array_equal(result.returns, [3, 3, 3, 3])
+    np.testing.assert_array_equal(result.lengths, [3, 3, 3, 3])
+
+
+def test_truncated_episodes():
+    result = run(constant_reward(5))
+    np.testing.assert_array_equal(result.returns, [5, 5, 5, 5])
+    np.testing.assert_array_equal(result.lengths, [5, 5, 5, 5])
+
+
+def test_each_episode_counts_to_its_own_end_and_no_further():
+    env = random_lengths()
+    lengths = np.asarray(rollout.reset(env, KEY, 16).obs)[:, 0]
+    assert len(set(lengths)) > 3
+    result = run(env, episodes=16)
+    np.testing.assert_array_equal(result.lengths, lengths)
+    np.testing.assert_array_equal(result.returns, lengths * (lengths + 1) / 2)
+
+
+def test_the_policy_decides():
+    env = one_step()
+    starts = np.asarray(rollout.reset(env, KEY, 8).obs)[:, 0]
+    assert len(np.unique(starts)) == 8
+    best = run(env, policy=lambda obs: obs, episodes=8)
+    np.testing.assert_allclose(best.returns, starts, rtol=1e-6)
+    np.testing.assert_allclose(run(env, episodes=8).returns, starts - starts**2, rtol=1e-5)
+
+
+def test_a_key_repeats_an_evaluation_and_another_gives_other_starts():
+    env = one_step()
+    evaluation = jax.jit(lambda key: evaluate(env, zeros, key, 4))
+    first, again, other = (evaluation(jax.random.key(seed)).returns for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert not np.any(first == other)
+
+
+def test_members_evaluate_side_by_side_as_they_do_alone():
+    keys = jax.random.split(KEY, 3)
+    env = random_lengths()
+    together = jax.jit(jax.vmap(lambda key: evaluate(env, zeros, key, 4)))(keys)
+    alone = jax.jit(lambda key: evaluate(env, zeros, key, 4))
+    for i in range(3):
+        np.testing.assert_array_equal(together.lengths[i], alone(keys[i]).lengths)
+        np.testing.assert_array_equal(together.returns[i], alone(keys[i]).returns)

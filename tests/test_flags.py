@@ -1,0 +1,133 @@
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+from experiments import flags
+from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.config import AgentConfig, TrainConfig
+
+
+def parse(*arguments):
+    return flags.parse(["run", "--algo=sac_sqt", "--env=ant", *arguments])
+
+
+def test_defaults_leave_all_settings_to_the_algorithm():
+    options = parse()
+    assert (options.algo, options.env, options.seeds) == ("sac_sqt", "ant", (0, 1, 2, 3, 4))
+    assert options.settings == {} and options.sweep == {}
+    assert (options.preset, options.out, options.name) == ("paper", "runs", None)
+    assert options.tensorboard and not options.quiet
+
+
+def test_settings_are_parsed_by_type():
+    settings = parse(
+        "--steps=1e6",
+        "--warmup_steps",
+        "1_000",
+        "--hidden=64,32",
+        "--lr=1e-3",
+        "--nopenalty_inside_gamma",
+        "--reduce=mean",
+    ).settings
+    assert settings == {
+        "steps": 1_000_000,
+        "warmup_steps": 1_000,
+        "hidden": (64, 32),
+        "lr": 1e-3,
+        "penalty_inside_gamma": False,
+        "reduce": "mean",
+    }
+    assert type(settings["steps"]) is int
+
+
+def test_lists_of_scalars_are_sweeps_and_single_values_are_settings():
+    options = parse("--tau=0.01", "--lr=1e-3,1e-4", "--penalty_coef=0,0.5", "--seeds=7,3")
+    assert options.settings == {"tau": 0.01}
+    assert list(options.sweep.items()) == [("penalty_coef", (0.0, 0.5)), ("lr", (1e-3, 1e-4))]
+    assert options.seeds == (7, 3)
+
+
+def test_temperature_auto_is_learned():
+    assert parse("--temperature=auto").settings == {"learn_temperature": True}
+    assert parse("--temperature=0.1,0.2").sweep == {"temperature": (0.1, 0.2)}
+
+
+BAD = {
+    "--stepz=5": "--stepz: unknown flag; did you mean --steps?",
+    "--wibble": "--wibble: unknown flag; --help lists the flags",
+    "--steps=many": "--steps=many: takes a whole number",
+    "--steps=1.5": "--steps=1.5: takes a whole number",
+    "--steps=inf": "--steps=inf: takes a whole number",
+    "--steps=": "--steps=: takes a whole number",
+    "--steps": "--steps: takes a whole number",
+    "--steps=-5": "--steps: takes a whole number from 1 to 2147483647, not -5",
+    "--lr=nan": "--lr=nan: takes a number, or a list like 0.1,0.5",
+    "--lr=0.1,,0.2": "--lr=0.1,,0.2: takes a number, or a list like 0.1,0.5",
+    "--lr=0.1,0.1": "--lr: takes each value once, 0.1 is there 2 times",
+    "--penalty_coef=-0.5": "--penalty_coef: takes a number of at least 0, not -0.5",
+    "--penalty_coef=0.5,-1": "--penalty_coef: takes a number of at least 0, not -1.0",
+    "--exploration_noise=inf": "--exploration_noise=inf: takes a number",
+    "--temperature=warm": "--temperature=warm: takes a number, a list like 0.1,0.2, or auto",
+    "--hidden=64,wide": "--hidden=64,wide: takes whole numbers like 256,256",
+    "--tensorboard=maybe": "--tensorboard=maybe: takes true or false",
+    "--seeds=": "--seeds=: takes whole numbers like 0,1,2",
+    "--seeds=0,1,0": "--seeds: takes each value once, 0 is there 2 times",
+    "--seeds=-1": "--seeds=-1: takes whole numbers from 0 to 4294967295",
+    "--seeds=4294967296": "--seeds=4294967296: takes whole numbers from 0 to 4294967295",
+    "--seeds=0.5": "--seeds=0.5: takes whole numbers like 0,1,2",
+    "--preset=fast": "--preset=fast: takes one of paper, quick",
+    "--name=a/b": "--name=a/b: takes up to 200 bytes without slashes: it becomes a folder's name",
+    "--name=..": "--name=..: takes up to 200 bytes without slashes: it becomes a folder's name",
+    "--name=": "--name=: takes up to 200 bytes without slashes: it becomes a folder's name",
+    "--name=a\tb": "--name=a\tb: takes up to 200 bytes without slashes: it becomes a folder's name",
+    "--out=": "--out=: takes a folder",
+    "extra": "extra: unexpected argument; settings are given as --flag=value",
+}
+
+
+@pytest.mark.parametrize("argument", BAD)
+def test_bad_arguments_are_named_with_what_they_take(argument):
+    with pytest.raises(flags.UsageError) as error:
+        parse(argument)
+    assert str(error.value) == BAD[argument]
+
+
+@pytest.mark.parametrize("missing", ["algo", "env"])
+def test_algorithm_and_environment_are_required(missing):
+    given = {"algo": "--algo=sac", "env": "--env=ant"}
+    with pytest.raises(flags.UsageError, match=f"^--{missing}: is required"):
+        flags.parse(["run", *(text for name, text in given.items() if name != missing)])
+
+
+@pytest.mark.parametrize("word", ["--help", "-h"])
+def test_help_wins_over_everything_else(word):
+    assert flags.parse(["run", "--stepz=5", word]) is None
+
+
+def test_every_setting_is_a_flag_with_help_and_its_default():
+    text = flags.help_text()
+    rows = {flag.name: flag for group in flags.FLAGS.values() for flag in group}
+    for field in [*dataclasses.fields(AgentConfig), *dataclasses.fields(TrainConfig)]:
+        if field.name in flags.NOT_FLAGS:
+            continue
+        assert rows[field.name].help, f"SETTING_HELP has no line for {field.name}"
+        assert f"--{field.name}" in text
+    assert "--steps=N " in text and "(1000000)" in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_defaults_that_differ_between_algorithms_are_told():
+    varied = {name for row in ALGORITHMS.values() for name in row.settings} - set(flags.NOT_FLAGS)
+    assert varied == set(flags.DEFAULT_TEXT)
+    assert ALGORITHMS["sac_sqt"].settings["penalty_coef"] == 0.5
+    assert ALGORITHMS["td3_sqt_tuple"].settings["penalty_coef"] == 0.1
+    assert ALGORITHMS["td3"].settings["policy_delay"] == 2
+
+
+def test_reading_the_command_line_imports_nothing_heavy():
+    heavy = ("mujoco.mjx", "matplotlib", "tensorboardX", "scipy.stats")
+    code = f"import sys, experiments.run; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "[]\n"

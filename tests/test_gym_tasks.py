@@ -1,0 +1,133 @@
+"""The pieces of the locomotion tasks by hand; whole steps are compared in test_gymnasium_parity."""
+
+import sys
+import types
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sqt_jax import envs
+from sqt_jax.envs import TASKS, gym_tasks
+from sqt_jax.envs.physics import PHYSICS, Physics, PhysicsState
+
+
+def state(qpos=(0.0,), qvel=(0.0,), displacement=0.0, quantities=None):
+    array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return PhysicsState(array(qpos), array(qvel), array(displacement), quantities or {}, ())
+
+
+@pytest.mark.parametrize(
+    ("name", "control", "expected"),
+    [
+        # displacement 0.1 m in 0.05 s: 2 m/s
+        ("cheetah", [0.5, -0.5, 1, 0, 0, 0], 2 - 0.1 * 1.5),
+        ("walker", [0.5, -0.5, 1, 0, 0, 0], 2 + 1 - 0.001 * 1.5),
+        ("ant", [0.5, -0.5, 1, 0, 0, 0, 0, 0], 2 + 1 - 0.5 * 1.5),
+        ("humanoid", [0.4] * 10 + [0] * 7, 1.25 * 2 + 5 - 0.1 * 1.6),
+    ],
+)
+def test_reward_by_hand(name, control, expected):
+    reward = gym_tasks.reward(TASKS[name], state(displacement=0.1), jnp.asarray(control, jnp.float32), 0.05)
+    np.testing.assert_allclose(reward, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "qpos", "healthy"),
+    [
+        ("walker", [9, 1.25, 0], True),
+        ("walker", [9, 0.79, 0], False),
+        ("walker", [9, 2.01, 0], False),
+        ("walker", [9, 1.25, 1.01], False),
+        ("walker", [9, 1.25, -1.01], False),
+        ("ant", [9, 9, 0.21], True),
+        ("ant", [9, 9, 1.0], True),  # its limits are included
+        ("ant", [9, 9, 0.19], False),
+        ("ant", [9, 9, 1.01], False),
+        ("humanoid", [9, 9, 1.4], True),
+        ("humanoid", [9, 9, 1.0], False),  # its limits are not
+        ("humanoid", [9, 9, 2.0], False),
+    ],
+)
+def test_healthy_ranges(name, qpos, healthy):
+    assert bool(TASKS[name].healthy(jnp.asarray(qpos, jnp.float32))) is healthy
+
+
+def test_cheetah_never_terminates():
+    assert TASKS["cheetah"].healthy is None
+
+
+def test_observation_leaves_out_the_horizontal_position():
+    np.testing.assert_array_equal(gym_tasks.observe(TASKS["cheetah"], state([1, 2, 3], [4, 5])), [2, 3, 4, 5])
+    np.testing.assert_array_equal(gym_tasks.observe(TASKS["ant"], state([1, 2, 3], [4, 50])), [3, 4, 50])
+
+
+def test_walker_observes_clipped_velocities():
+    np.testing.assert_array_equal(gym_tasks.observe(TASKS["walker"], state([1, 20], [-30, 30])), [20, -10, 10])
+
+
+def test_humanoid_observes_its_quantities_in_order():
+    fields = {"cfrc_ext": jnp.full(1, 4.0), "qfrc_actuator": jnp.full(1, 3.0), "cvel": jnp.full(1, 2.0)}
+    fields["cinert"] = jnp.full(1, 1.0)
+    obs = gym_tasks.observe(TASKS["humanoid"], state([7, 7, 0], [0], quantities=fields))
+    np.testing.assert_array_equal(obs, [0, 0, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_starts_have_gymnasiums_distribution(name):
+    task, model = TASKS[name], gym_tasks.load_model(TASKS[name])
+    scale = gymnasium.spec(task.gymnasium_id).kwargs.get("reset_noise_scale", task.noise)
+    assert task.noise == scale
+    keys = jax.random.split(jax.random.key(0), 4000)
+    qpos, qvel = jax.vmap(lambda key: gym_tasks.draw_start(task, model.qpos0, model.nv, key))(keys)
+    offset = (np.asarray(qpos, np.float64) - model.qpos0) / task.noise
+    velocity = np.asarray(qvel, np.float64) / task.noise
+    assert np.abs(offset).max() <= 1 + 2e-4  # rounding at a rest pose of up to 1.4
+    assert np.abs(offset).max() > 0.99
+    np.testing.assert_allclose(offset.mean(axis=0), 0, atol=0.05)
+    np.testing.assert_allclose(offset.std(axis=0), 1 / np.sqrt(3), atol=0.03)
+    np.testing.assert_allclose(velocity.mean(axis=0), 0, atol=0.08)
+    np.testing.assert_allclose(velocity.std(axis=0), 1 if task.normal_velocity else 1 / np.sqrt(3), atol=0.05)
+    assert (np.abs(velocity).max() > 2) == task.normal_velocity
+    assert np.abs(np.corrcoef(offset[:, 0], velocity[:, 0])[0, 1]) < 0.06  # positions and velocities: own draws
+
+
+@pytest.mark.parametrize(("name", "limit"), [("cheetah", 1.0), ("walker", 1.0), ("ant", 1.0), ("humanoid", 0.4)])
+def test_actions_are_stretched_to_the_actuators_range(name, limit, recording_physics):
+    env = envs.make(name, physics="recording")
+    action = jnp.linspace(-1, 1, env.action_size)
+    timestep = env.step(env.reset(jax.random.key(0)), action)
+    np.testing.assert_allclose(timestep.state.task.internal, limit * action, rtol=1e-6)
+    expected = TASKS[name].alive - TASKS[name].ctrl_cost * np.sum((limit * np.asarray(action)) ** 2)
+    np.testing.assert_allclose(timestep.reward, expected, rtol=1e-5)  # the cost is that of the stretched action
+    excess = env.step(env.reset(jax.random.key(0)), 5 * jnp.ones(env.action_size))
+    np.testing.assert_allclose(excess.state.task.internal, limit, rtol=1e-6)
+
+
+@pytest.fixture
+def recording_physics(monkeypatch):
+    """A simulator in which nothing moves and the state keeps the last control."""
+
+    def make(setup):
+        shapes = {"cinert": setup.model.nbody * 10, "cvel": setup.model.nbody * 6, "qfrc_actuator": setup.model.nv}
+        shapes["cfrc_ext"] = setup.model.nbody * 6
+        fields = {field: jnp.zeros(shapes[field]) for field in setup.quantities}
+
+        def place(qpos, qvel):
+            return PhysicsState(qpos, qvel, jnp.zeros(()), fields, jnp.zeros(setup.model.nu))
+
+        return Physics(place, lambda state, control: state._replace(internal=control))
+
+    module = types.ModuleType("recording_physics")
+    module.make = make
+    monkeypatch.setitem(sys.modules, "recording_physics", module)
+    monkeypatch.setitem(PHYSICS, "recording", "recording_physics")
+
+
+def test_models_load_without_a_log_file(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    gym_tasks.load_model(TASKS["cheetah"])
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,128 @@
+"""Imports go downwards only, read from the source text."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# From the ground up; a module imports from lower layers only, or from its own package further down.
+LAYERS = [
+    {"sqt_jax.types"},
+    {
+        "sqt_jax.config",
+        "sqt_jax.q_targets",
+        "sqt_jax.networks",
+        "sqt_jax.losses",
+        "sqt_jax.optimizers",
+        "sqt_jax.replay",
+    },
+    {"sqt_jax.agents", "sqt_jax.envs"},
+    {"sqt_jax.rollout"},
+    {"sqt_jax.evaluate"},
+    {"sqt_jax.train"},
+    {"sqt_jax.algorithms"},
+    {"sqt_jax.policy"},
+    {"sqt_jax"},
+    {"experiments"},
+]
+PACKAGES = ("sqt_jax.agents", "sqt_jax.envs", "experiments")
+# Beyond the order of the layers.
+NEVER = {
+    "sqt_jax.agents": ("sqt_jax.envs", "sqt_jax.replay"),
+    "sqt_jax.envs": ("sqt_jax.agents", "sqt_jax.replay", "sqt_jax.networks", "sqt_jax.losses", "sqt_jax.q_targets"),
+    # agent, environment and replay come as values
+    "sqt_jax.train": ("sqt_jax.agents", "sqt_jax.envs", "sqt_jax.replay"),
+    "sqt_jax.rollout": ("sqt_jax.agents", "sqt_jax.envs", "sqt_jax.replay"),
+    "sqt_jax.evaluate": ("sqt_jax.agents", "sqt_jax.envs", "sqt_jax.replay"),
+}
+
+
+def modules(folder: str) -> dict[str, Path]:
+    found = {}
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules("sqt_jax") | modules("experiments")
+
+
+def imports(source: str, package: str, known=frozenset(MODULES)) -> set[str]:
+    """The modules of this repository that a source text imports, wherever in it."""
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                names.add(f"{base}.{alias.name}" if f"{base}.{alias.name}" in known else base)
+    return {name for name in names if name.split(".")[0] in ("sqt_jax", "experiments", "tests")}
+
+
+def inside(module: str, package: str) -> bool:
+    return module == package or module.startswith(package + ".")
+
+
+def unit(module: str) -> str:
+    """The package of the layers that a module belongs to, or itself."""
+    return next((package for package in PACKAGES if inside(module, package)), module)
+
+
+def layer(module: str) -> int:
+    ranks = [rank for rank, members in enumerate(LAYERS) if unit(module) in members]
+    assert len(ranks) == 1, f"{module} has no place among the layers: give it one in {Path(__file__).name}"
+    return ranks[0]
+
+
+def imported(module: str) -> set[str]:
+    path = MODULES[module]
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    return imports(path.read_text(), package)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_go_downwards(module):
+    for other in imported(module):
+        if unit(other) != unit(module):
+            assert layer(other) < layer(module), f"{module} imports {other}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_parts_that_must_not_know_each_other(module):
+    forbidden = NEVER.get(unit(module), ())
+    assert not [other for other in imported(module) for package in forbidden if inside(other, package)]
+
+
+def test_the_library_knows_neither_experiments_nor_tests():
+    for module in modules("sqt_jax"):
+        assert not [other for other in imported(module) if not inside(other, "sqt_jax")]
+    assert not [other for module in MODULES for other in imported(module) if inside(other, "tests")]
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    remaining = {module: imported(module) & set(MODULES) - {module} for module in MODULES}
+    while free := [module for module, needs in remaining.items() if not needs & set(remaining)]:
+        for module in free:
+            del remaining[module]
+    assert not remaining
+
+
+def test_agents_do_not_import_each_other():
+    agents = [module for module in MODULES if inside(module, "sqt_jax.agents")]
+    for module in agents:
+        others = {name for name in imported(module) if inside(name, "sqt_jax.agents")}
+        assert others <= {"sqt_jax.agents.critic"} - {module}
+
+
+def test_the_reader_of_imports_sees_all_their_forms():
+    known = frozenset({"sqt_jax.envs", "sqt_jax.train", "sqt_jax.types", "sqt_jax.agents.sac", "experiments.run"})
+    source = (
+        "import jax\nimport sqt_jax.envs as e\nfrom sqt_jax import train\nfrom sqt_jax.types import Array\n"
+        "def f():\n    from .agents import sac\n    import experiments.run\n"
+    )
+    assert imports(source, "sqt_jax", known) == known

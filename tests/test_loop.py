@@ -1,0 +1,171 @@
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.loop import IntervalMetrics, Pace, train_loop
+from sqt_jax.config import TrainConfig
+from sqt_jax.evaluate import Evaluation
+from sqt_jax.train import Sweep
+
+
+class FakeAgent(NamedTuple):
+    params: jnp.ndarray  # [S]
+    gradient_steps: jnp.ndarray  # []
+
+
+class Recorder:
+    """Two members, a sweep that counts instead of training (a second per 100 steps), and a display that keeps quiet."""
+
+    def __init__(self, train, breaks_at=None):
+        self.train, self.breaks_at = train, breaks_at
+        self.now, self.done = 0.0, 0
+        self.calls, self.reports, self.statuses, self.messages = [], [], [], []
+        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate)
+        self.evaluated = lambda steps, returns: None
+        self.update, self.message = self.statuses.append, self.messages.append
+
+    def advance(self, state, steps, learn):
+        self.calls.append((steps, learn))
+        self.done += steps * self.train.num_envs
+        self.now += steps / 100
+        params = state.agent.params
+        if self.breaks_at is not None and self.done >= self.breaks_at:
+            params = params.at[1].set(jnp.nan)
+        agent = FakeAgent(params, state.agent.gradient_steps + steps * learn)
+        loss = np.full(2, float(self.done) if learn else np.nan)
+        episodes = {
+            "train_episodes": np.zeros(2),
+            "train_return": np.full(2, np.nan),
+            "train_length": np.full(2, np.nan),
+        }
+        return SimpleNamespace(agent=agent), {"loss": loss} | episodes
+
+    def evaluate(self, state):
+        self.now += 0.5
+        return Evaluation(np.array([[self.done, self.done + 2], [0.0, 0.0]]), np.full((2, 2), 10))
+
+    def run(self, stop=lambda: False):
+        state = SimpleNamespace(agent=FakeAgent(jnp.zeros(2), jnp.zeros((), jnp.int32)))
+        return train_loop(
+            self.sweep,
+            state,
+            self.train,
+            2,
+            report=self.reports.append,
+            display=self,
+            stop=stop,
+            clock=lambda: self.now,
+        )
+
+
+TRAIN = TrainConfig(steps=2_000, warmup_steps=750, eval_every=500)
+
+
+def test_evaluations_lie_at_zero_every_interval_and_the_end():
+    recorder = Recorder(TRAIN)
+    outcome = recorder.run()
+    assert [report.env_steps for report in recorder.reports] == [0, 500, 1_000, 1_500, 2_000]
+    assert recorder.reports[0].metrics == {}
+    assert recorder.reports[2].returns.tolist() == [[1_000, 1_002], [0, 0]]
+    assert (outcome.env_steps, outcome.interrupted, outcome.diverged) == (2_000, False, {})
+
+
+def test_the_full_protocol_has_201_evaluations():
+    recorder = Recorder(TrainConfig())
+    recorder.run()
+    assert len(recorder.reports) == 201
+
+
+def test_chunks_end_at_the_warm_up_and_follow_the_speed():
+    recorder = Recorder(TRAIN)
+    recorder.run()
+    assert recorder.calls[0] == (1, False)  # compiles
+    assert sum(steps for steps, learn in recorder.calls if not learn) == 750
+    assert sum(steps for steps, learn in recorder.calls if learn) == 1_250
+    assert recorder.calls[1:3] == [(10, False), (200, False)]  # 100 steps a second, two seconds a chunk
+    assert max(steps for steps, _ in recorder.calls) == 200
+    assert int(recorder.reports[-1].gradient_steps) == 1_250
+
+
+def test_environments_in_lockstep_share_the_steps():
+    recorder = Recorder(TrainConfig(steps=400, warmup_steps=100, eval_every=200, num_envs=4))
+    recorder.run()
+    assert sum(steps for steps, _ in recorder.calls) == 100
+    assert [report.env_steps for report in recorder.reports] == [0, 200, 400]
+
+
+def test_metrics_are_those_since_the_last_evaluation():
+    recorder = Recorder(TRAIN)
+    recorder.run()
+    assert np.isnan(recorder.reports[1].metrics["loss"]).all()  # warm-up
+    # The fake loss of a chunk is the step at its end.
+    ends = np.cumsum([steps for steps, _ in recorder.calls])
+    steps = np.array([steps for steps, _ in recorder.calls])
+    last = ends > 1_500
+    expected = np.sum(ends[last] * steps[last]) / np.sum(steps[last])
+    np.testing.assert_allclose(recorder.reports[-1].metrics["loss"], expected)
+
+
+def test_phases_and_time_left_are_shown():
+    recorder = Recorder(TRAIN)
+    recorder.run()
+    phases = [status.phase for status in recorder.statuses]
+    assert phases[:3] == ["compiling the evaluation", "compiling the training", "warm-up"]
+    assert {"training", "evaluating"} <= set(phases)
+    last = recorder.statuses[-1]
+    assert last.phase == "evaluating" and last.env_steps == 2_000
+    assert last.eta == pytest.approx(0.5)  # the last evaluation itself
+    assert last.steps_per_second == pytest.approx(200)  # of both members
+
+
+def test_stopping_reports_what_there_is():
+    recorder = Recorder(TRAIN)
+    outcome = recorder.run(stop=lambda: recorder.done >= 1_100)
+    assert outcome.interrupted and 1_100 <= outcome.env_steps < 1_500
+    last = recorder.reports[-1]
+    assert last.returns is None and last.env_steps == outcome.env_steps
+    assert np.isfinite(last.metrics["loss"]).all()
+    assert len(recorder.reports) == 4  # 0, 500, 1000 and the rest
+
+
+def test_a_run_stopped_before_its_last_evaluation_is_interrupted():
+    recorder = Recorder(TRAIN)
+    outcome = recorder.run(stop=lambda: recorder.done >= 2_000)
+    assert outcome.interrupted and outcome.env_steps == 2_000
+
+
+def test_a_member_with_numbers_that_are_not_finite_is_named_once():
+    recorder = Recorder(TRAIN, breaks_at=800)
+    outcome = recorder.run()
+    assert outcome.diverged == {1: 1_000}
+    assert recorder.messages == ["member 1 diverged: not all its numbers are finite at step 1,000"]
+    assert not outcome.interrupted and outcome.env_steps == 2_000
+
+
+def test_interval_metrics_weigh_steps_and_episodes():
+    interval = IntervalMetrics()
+    nan = np.nan
+    first = {"loss": [1.0, nan], "train_return": [10.0, nan], "train_length": [5.0, nan], "train_episodes": [2.0, 0.0]}
+    second = {"loss": [4.0, 6.0], "train_return": [40.0, nan], "train_length": [8.0, nan], "train_episodes": [1.0, 0.0]}
+    for metrics, steps in ((first, 10), (second, 30)):
+        interval.add({name: np.array(values) for name, values in metrics.items()}, steps)
+    result = interval.result()
+    np.testing.assert_allclose(result["loss"], [(1 * 10 + 4 * 30) / 40, 6.0])
+    np.testing.assert_allclose(result["train_return"], [(10 * 2 + 40 * 1) / 3, nan])
+    np.testing.assert_allclose(result["train_length"], [6.0, nan])
+    np.testing.assert_allclose(result["train_episodes"], [3.0, 0.0])
+
+
+def test_the_first_chunk_is_not_timed():
+    pace = Pace()
+    assert pace.chunk(False, 1_000) == 1
+    pace.advanced(False, 1, 60.0)
+    assert pace.rates == {} and pace.train_seconds == 0.0
+    assert pace.chunk(False, 1_000) == 10
+    pace.advanced(False, 10, 0.1)
+    assert pace.chunk(False, 1_000) == 200
+    assert pace.chunk(False, 50) == 50
+    assert pace.chunk(True, 1_000) == 10  # another speed

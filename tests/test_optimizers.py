@@ -1,0 +1,63 @@
+"""Adam against optax's own, and the soft step of target networks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from sqt_jax.optimizers import adam_init, adam_step, soft_update
+
+PARAMS = {"kernel": jnp.array([[1.0, -2.0]]), "bias": jnp.array([0.5, 0.0])}
+
+
+def loss(params):
+    return jnp.sum(params["kernel"] ** 2) + jnp.sum(jnp.sin(params["bias"]))
+
+
+def run(lr, steps, step=adam_step):
+    params, opt_state = PARAMS, adam_init(PARAMS)
+    for _ in range(steps):
+        params, opt_state = step(params, opt_state, jax.grad(loss)(params), lr)
+    return params, opt_state
+
+
+def assert_same(a, b, **tolerance):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **tolerance), a, b)
+
+
+@pytest.mark.parametrize("lr", [3e-4, 0.1])
+def test_adam_is_optax_adam(lr):
+    reference = optax.adam(lr)
+    params, opt_state = PARAMS, reference.init(PARAMS)
+    for _ in range(5):
+        updates, opt_state = reference.update(jax.grad(loss)(params), opt_state)
+        params = optax.apply_updates(params, updates)
+    assert_same(run(lr, 5)[0], params, rtol=1e-6)
+
+
+def test_the_first_step_has_the_learning_rates_length():
+    first = run(0.01, 1)[0]
+    np.testing.assert_allclose(first["kernel"], [[0.99, -1.99]], rtol=1e-5)
+    np.testing.assert_allclose(first["bias"], [0.49, -0.01], rtol=1e-5)
+
+
+def test_learning_rates_share_one_compilation():
+    step = jax.jit(adam_step)
+    slow, fast = run(jnp.float32(1e-3), 1, step)[0], run(jnp.float32(1e-2), 1, step)[0]
+    assert step._cache_size() == 1
+    change = jax.tree.map(lambda s, f, p: (f - p) / (s - p), slow, fast, PARAMS)
+    assert_same(change, jax.tree.map(lambda p: jnp.full(p.shape, 10.0), PARAMS), rtol=1e-2)
+
+
+def test_learning_rate_zero_moves_nothing_but_the_moments():
+    params, opt_state = run(0.0, 2)
+    assert_same(params, PARAMS)
+    assert opt_state.count == 2
+    assert np.all(opt_state.mu["kernel"] != 0)
+
+
+@pytest.mark.parametrize(("tau", "expected"), [(0.0, [1, 2]), (1.0, [5, -2]), (0.25, [2, 1])])
+def test_soft_update(maybe_jit, tau, expected):
+    target, online = {"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([5.0, -2.0])}
+    np.testing.assert_allclose(maybe_jit(soft_update)(target, online, tau)["w"], expected, rtol=1e-6)

@@ -1,0 +1,103 @@
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experiments.progress import (
+    PLAIN_SECONDS,
+    Display,
+    Status,
+    eta_seconds,
+    evaluation_share,
+    final_table,
+    format_seconds,
+)
+
+
+def make_console(terminal):
+    return Console(file=io.StringIO(), force_terminal=terminal, width=100, color_system=None, legacy_windows=False)
+
+
+def test_eta_adds_the_phases_and_the_evaluations():
+    # 100 warm-up steps at 50/s, 600 learning steps at 20/s, 3 evaluations of 4 s: 2 + 30 + 12.
+    assert eta_seconds({False: 100, True: 600}, {False: 50.0, True: 20.0}, 3, 4.0) == 44.0
+
+
+def test_eta_is_unknown_while_what_is_left_was_never_timed():
+    assert eta_seconds({False: 0, True: 600}, {False: 50.0}, 0, None) is None
+    assert eta_seconds({False: 0, True: 600}, {True: 20.0}, 1, None) is None
+    assert eta_seconds({False: 100, True: 0}, {False: 50.0}, 0, None) == 2.0
+    assert eta_seconds({False: 0, True: 0}, {}, 0, None) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "-"), (0.2, "0:00"), (59.6, "1:00"), (123, "2:03"), (3723, "1:02:03"), (360000, "100:00:00")],
+)
+def test_seconds_as_text(seconds, text):
+    assert format_seconds(seconds) == text
+
+
+def test_share_of_evaluation_of_the_full_protocol():
+    text = evaluation_share(1_000_000, 201, 10, 1_000)
+    assert "201 evaluations of 10 episodes" in text
+    assert "up to 2,010,000 steps (67% of all)" in text
+
+
+def test_plain_output_is_a_line_per_evaluation_and_few_others():
+    now = [0.0]
+    console = make_console(terminal=False)
+    with Display(console, 1_000, clock=lambda: now[0]) as display:
+        display.update(Status("compiling the training", 0, None, None, None))
+        for step in range(1, 61):  # a minute, one update a second
+            now[0] = float(step)
+            display.update(Status("training", step, 123.4, 60.0 - step, 5.0))
+        display.evaluated(60, np.array([1.0, 3.0]))
+    lines = console.file.getvalue().splitlines()
+    assert lines[0] == "compiling the training, step 0 of 1,000, - steps/s, return -, left -"
+    assert lines[-1] == "step        60: return 2.0 +- 1.0 over 2 members"
+    progress = lines[1:-1]
+    assert len(progress) == 60 / PLAIN_SECONDS
+    assert progress[0] == "training, step 10 of 1,000, 123 steps/s, return 5.0, left 0:50"
+    assert "\x1b" not in console.file.getvalue()
+
+
+def test_a_terminal_gets_a_live_line():
+    console = make_console(terminal=True)
+    with Display(console, 1_000) as display:
+        display.update(Status("warm-up", 250, 1234.0, 61.0, 5.0))
+        display.evaluated(250, np.array([7.0]))
+    text = console.file.getvalue()
+    assert "\x1b[2K" in text  # the line is erased and written again
+    assert "warm-up" in text and "250/1,000  1,234 steps/s  return 5.0  left 1:01" in text
+    assert "step       250: return 7.0\n" in text
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_quiet_shows_messages_only(terminal):
+    console = make_console(terminal)
+    with Display(console, 1_000, quiet=True) as display:
+        display.update(Status("compiling the training", 0, None, None, None))
+        display.evaluated(250, np.array([7.0]))
+        display.message("member 3 diverged")
+    assert console.file.getvalue() == "member 3 diverged\n"
+
+
+def test_final_table_has_the_members_and_the_groups():
+    member = {"member": 0, "seed": 7, "penalty_coef": 0.5, "final_return": 1.25, "best_return": 2.5, "q_std": 0.125}
+    group = {
+        "penalty_coef": 0.5,
+        "seeds": [7, 8],
+        "final": {"mean": 1.0, "std": 0.25},
+        "score": {"mean": 2.0, "std": 0.5},
+    }
+    lost = member | {"member": 1, "seed": 8, "best_return": None, "q_std": None}
+    summary = {"members": [member, lost], "groups": [group], "diverged": [{"member": 1, "env_steps": 30}]}
+    console = make_console(terminal=False)
+    console.print(final_table(summary, []))
+    rows = [line.split() for line in console.file.getvalue().splitlines() if line.strip()]
+    assert rows[0] == ["member", "seed", "penalty_coef", "final", "return", "best", "return", "q_std"]
+    assert rows[2] == ["0", "7", "0.5", "1.2", "2.5", "0.125"]
+    assert rows[3] == ["1", "(diverged)", "8", "0.5", "1.2", "-", "-"]
+    assert rows[-1] == ["mean", "+-", "std", "2", "seeds", "0.5", "1.0", "+-", "0.2", "2.0", "+-", "0.5"]
