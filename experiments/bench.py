@@ -22,6 +22,7 @@ from absl import app, flags
 from rich.console import Console
 from rich.table import Table
 
+from experiments import runtime
 from sqt_jax import algorithms, envs, replay, rollout, train
 from sqt_jax.types import Array, Transition
 
@@ -227,6 +228,7 @@ def main(argv: Sequence[str]) -> None:
     unknown = [suite for suite in FLAGS.suites if suite not in SUITES]
     if unknown:
         sys.exit(f"--suites: takes some of {', '.join(SUITES)}, not {unknown[0]!r}")
+    runtime.prepare()
     console = Console()
     console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
     found = []

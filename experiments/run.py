@@ -141,6 +141,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
         if options is None:
             print(flags.help_text())
             return DONE
+        runtime.prepare()
         return run(make_plan(options, env), argv)
     except flags.UsageError as error:
         line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error))

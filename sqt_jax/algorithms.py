@@ -92,7 +92,10 @@ def make_trainer(config: Config, env: Environment | None = None) -> train.Traine
 
 
 def make_train(config: Config, env: Environment | None = None) -> Callable[..., tuple[train.TrainState, train.History]]:
-    """A whole run of one member, `train(key, scalars=None) -> (state, history)`, for `jax.jit(jax.vmap(train))(keys)`."""
+    """A whole run of one member: `train(key, scalars=None) -> (state, history)`.
+
+    `jax.jit(jax.vmap(train))(keys)` is a sweep over seeds; `scalars` of [S] arrays beside the keys sweep those too.
+    """
     return train.make_train(make_trainer(config, env), config.train)
 
 

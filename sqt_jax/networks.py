@@ -1,18 +1,25 @@
 """Actors and critics. Parameters are `{layer: {kernel [in, out], bias [out]}}`; critics have a leading axis N."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.types import Array
+from sqt_jax.types import Array, Params
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
 
-def uniform_fan_in(bound: float):
+class Network(NamedTuple):
+    """A module as the two functions that are used of it."""
+
+    init: Callable[..., Params]  # (key, *inputs) -> parameters
+    apply: Callable[..., Any]  # (parameters, *inputs) -> outputs
+
+
+def uniform(bound: float):
     """Initialiser of U(-bound, bound)."""
 
     def init(key, shape, dtype=jnp.float32):
@@ -28,7 +35,7 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        init = uniform_fan_in(x.shape[-1] ** -0.5)
+        init = uniform(x.shape[-1] ** -0.5)
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         bias = self.param("bias", init, (self.features,))
         return x @ kernel + bias
@@ -99,8 +106,22 @@ class Critic(nn.Module):
         return Dense(1, name=f"layer{len(self.hidden)}")(x)[..., 0]
 
 
-def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> nn.Module:
-    """N independent critics as one module: obs [B, O], action [B, A] -> [N, B]."""
+def _network(module: nn.Module) -> Network:
+    return Network(module.init, module.apply)
+
+
+def tanh_actor(action_size: int, hidden: Sequence[int]) -> Network:
+    """obs [B, O] -> action [B, A] in (-1, 1)"""
+    return _network(TanhActor(action_size, hidden))
+
+
+def gaussian_actor(action_size: int, hidden: Sequence[int]) -> Network:
+    """obs [B, O] -> `Gaussian` of [B, A]"""
+    return _network(GaussianActor(action_size, hidden))
+
+
+def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> Network:
+    """N independent critics as one: obs [B, O], action [B, A] -> [N, B]"""
     ensemble = nn.vmap(
         Critic,
         in_axes=None,
@@ -109,4 +130,4 @@ def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> nn.Module:
         variable_axes={"params": 0},
         split_rngs={"params": True},
     )
-    return ensemble(hidden)
+    return _network(ensemble(hidden))

@@ -52,7 +52,7 @@ class _Mean(NamedTuple):
     """Running means of metrics; a NaN is a value that was not measured."""
 
     total: Metrics
-    count: Metrics
+    weight: Metrics
 
     @classmethod
     def start(cls, like: Metrics) -> "_Mean":
@@ -60,10 +60,10 @@ class _Mean(NamedTuple):
 
     def add(self, metrics: Metrics) -> "_Mean":
         total = jax.tree.map(lambda t, x: t + jnp.where(jnp.isnan(x), 0.0, x), self.total, metrics)
-        return _Mean(total, jax.tree.map(lambda c, x: c + ~jnp.isnan(x), self.count, metrics))
+        return _Mean(total, jax.tree.map(lambda w, x: w + ~jnp.isnan(x), self.weight, metrics))
 
     def result(self) -> Metrics:
-        return jax.tree.map(lambda t, c: t / c, self.total, self.count)  # 0 / 0 = NaN: never measured
+        return jax.tree.map(lambda t, w: t / w, self.total, self.weight)  # 0 / 0 = NaN: never measured
 
 
 def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainConfig) -> Trainer:
@@ -118,7 +118,7 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
         mean = _Mean.start(jax.eval_shape(agent.update, state.agent, sampled, state.key)[2])
         state = state._replace(episodes=state.episodes.forget_ended())
         learn = jnp.asarray(learn)
-        state, mean = jax.lax.fori_loop(0, num_steps, lambda _, carry: step(*carry, learn), (state, mean))
+        state, mean = jax.lax.fori_loop(0, num_steps, lambda _, carry: step(carry[0], carry[1], learn), (state, mean))
         episodes = state.episodes
         return state, mean.result() | {
             "train_return": episodes.ended_return / episodes.ended,

@@ -8,7 +8,7 @@ from sqt_jax.types import Environment
 
 
 def one_step() -> Environment:
-    """Every episode is one step; the reward is obs - (action - obs)², so Q*(obs, obs) = obs and the best action is obs."""
+    """One step an episode, reward obs - (action - obs)²: the best action is obs and Q*(obs, obs) = obs."""
 
     def start(key):
         obs = jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)

@@ -247,10 +247,10 @@ def test_a_split_batch_has_the_whole_batchs_penalty(inside):
         return target(next_q, reward, discount, penalty=penalty, penalty_inside_gamma=inside)
 
     halves = next_q.reshape(3, 2, 4).swapaxes(0, 1), reward.reshape(2, 4), discount.reshape(2, 4)
-    split = jax.vmap(partial(ours, axis_name="devices"), axis_name="devices")(*halves)
+    split = jax.jit(jax.vmap(partial(ours, axis_name="devices"), axis_name="devices"))(*halves)
     whole = ours(next_q, reward, discount)
     np.testing.assert_allclose(split.reshape(8), whole, rtol=1e-6)
-    alone = jax.vmap(ours)(*halves)  # without the mean over devices, each half has a penalty of its own
+    alone = jax.jit(jax.vmap(ours))(*halves)  # without the mean over devices, each half has a penalty of its own
     assert np.abs(alone.reshape(8) - whole).max() > 1e-3
 
 

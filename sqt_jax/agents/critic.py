@@ -20,19 +20,21 @@ def draw_subset(key: Array, config: AgentConfig) -> Array:
 
 
 def _reduction(config: AgentConfig, subset: Array) -> q_targets.Reduction:
-    return {
+    reductions: dict[str, q_targets.Reduction] = {
         "min": q_targets.min_over_critics,
         "mean": q_targets.mean_over_critics,
         "subset_min": functools.partial(q_targets.min_over_subset, subset=subset),
-    }[config.reduce]
+    }
+    return reductions[config.reduce]
 
 
-def _penalty(config: AgentConfig, coef: Array) -> q_targets.Penalty:
-    return {
+def _penalty(config: AgentConfig, coef: Array | float) -> q_targets.Penalty:
+    penalties: dict[str, q_targets.Penalty] = {
         "none": q_targets.no_penalty,
         "batch_std": functools.partial(q_targets.batch_std, coef=coef, ddof=config.ddof),
         "transition_std": functools.partial(q_targets.transition_std, coef=coef, ddof=config.ddof),
-    }[config.penalty]
+    }
+    return penalties[config.penalty]
 
 
 def td_target(
@@ -69,7 +71,7 @@ def update(
     opt_state,
     batch: Transition,
     target: Array,
-    lr: Array,
+    lr: Array | float,
 ) -> tuple[Params, object, Array, Metrics]:
     """One Adam step of all critics towards `target [B]`.
 

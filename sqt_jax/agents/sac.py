@@ -32,7 +32,7 @@ class SACNoise(NamedTuple):
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
-    actor_net = networks.GaussianActor(action_size, config.hidden)
+    actor_net = networks.gaussian_actor(action_size, config.hidden)
     critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
     target_entropy = -float(action_size)
 
@@ -68,7 +68,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             subset=critics.draw_subset(subset_key, config),
         )
 
-    def temperature(state: SACState) -> Array:
+    def temperature(state: SACState) -> Array | float:
         return jnp.exp(state.log_temperature) if config.learn_temperature else state.scalars.temperature
 
     def td_target(state: SACState, batch: Transition, noise: SACNoise) -> tuple[Array, dict[str, Array]]:

@@ -30,7 +30,7 @@ class TD3Noise(NamedTuple):
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
-    actor_net = networks.TanhActor(action_size, config.hidden)
+    actor_net = networks.tanh_actor(action_size, config.hidden)
     critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
 
     def init(key: Array, scalars: Scalars | None = None) -> TD3State:

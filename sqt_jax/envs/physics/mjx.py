@@ -135,7 +135,7 @@ def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     MuJoCo does so always, MJX only where the capsule is less than 60 degrees from the plane
     (https://github.com/google-deepmind/mujoco/issues/2774). A pyramidal friction cone is not symmetric about its axis:
-    without this, ten per cent of the ant's control steps are wrong by more than 0.1 rad/s.
+    without this, one control step of the ant in ten is wrong by about 0.1 rad/s or more.
     """
     contact = data._impl.contact
     first, second = contact.geom.T

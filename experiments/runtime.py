@@ -1,0 +1,28 @@
+"""What a process sets before JAX starts: the cache of compiled programs, and one XLA option."""
+
+import os
+from pathlib import Path
+
+# XLA's CPU backend compiles loops over little data into one function each. Its own limit leaves MJX's solver loops out,
+# whose many small kernels are then dispatched one by one (measured: BUILD_NOTES.md).
+SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+SMALL_LOOP_BYTES = 1_000_000
+
+
+def cache_directory() -> Path:
+    """`JAX_COMPILATION_CACHE_DIR`, or `sqt_jax` in the user's cache folder."""
+    named = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sqt_jax"
+
+
+def prepare() -> None:
+    """Call before the first computation. What the user has set in the environment stays."""
+    xla_flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_extra_options" not in xla_flags:
+        option = f"--xla_backend_extra_options={SMALL_LOOPS}={SMALL_LOOP_BYTES}"
+        os.environ["XLA_FLAGS"] = f"{xla_flags} {option}".strip()
+
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(cache_directory()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

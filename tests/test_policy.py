@@ -1,0 +1,58 @@
+"""A saved policy acts as the agent that it was saved from, and loading refuses what does not fit."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_envs
+import pytest
+
+from sqt_jax import algorithms, policy
+from sqt_jax.algorithms import ALGORITHMS
+
+
+def saved(algo, directory, members=2):
+    env = probe_envs.constant_reward()
+    config = algorithms.make_config(algo, "cheetah", hidden=(8, 8))
+    agent = algorithms.make_agent(config, env)
+    state = jax.vmap(agent.init)(jax.random.split(jax.random.key(1), members))
+    policy.save_policy(directory, config, env, state)
+    return agent, state
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
+    agent, state = saved(algo, tmp_path / "policy")
+    obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
+    for member in range(2):
+        own = jax.tree.map(lambda leaf, member=member: leaf[member], state)
+        expected = agent.act(own, obs, jax.random.key(0), deterministic=True)
+        np.testing.assert_allclose(policy.load_policy(tmp_path / "policy", member)(obs), expected, rtol=1e-6)
+
+
+def test_an_existing_policy_is_not_overwritten(tmp_path):
+    saved("td3", tmp_path / "policy")
+    with pytest.raises(FileExistsError):
+        saved("td3", tmp_path / "policy")
+
+
+def test_parameters_of_other_sizes_are_refused(tmp_path):
+    saved("td3", tmp_path / "policy")
+    path = tmp_path / "policy" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"action_size": 3}))
+    with pytest.raises(ValueError, match="does not hold the actor"):
+        policy.load_policy(tmp_path / "policy")
+
+
+def test_pickled_content_is_refused(tmp_path):
+    saved("td3", tmp_path / "policy")
+    np.savez(tmp_path / "policy" / "member_0.npz", x=np.array([{"code": 1}], dtype=object))
+    with pytest.raises(ValueError, match="allow_pickle"):
+        policy.load_policy(tmp_path / "policy")
+
+
+def test_a_missing_member_is_named(tmp_path):
+    saved("td3", tmp_path / "policy")
+    with pytest.raises(FileNotFoundError, match="member_7"):
+        policy.load_policy(tmp_path / "policy", member=7)
