@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import psutil
 from rich.console import Console
 
-from experiments import flags, progress
+from experiments import flags, progress, runtime
 from experiments.loop import train_loop
 from experiments.presets import preset_settings
 from sqt_jax import envs

@@ -65,6 +65,10 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
     physics = settings.pop("physics", Config.physics)
+    if physics not in envs.PHYSICS:
+        raise ConfigError("physics", f"takes one of {', '.join(envs.PHYSICS)}, not {physics!r}")
+    if isinstance(settings.get("hidden"), list):  # out of a JSON file
+        settings["hidden"] = tuple(settings["hidden"])
     for name in settings:
         if name not in AGENT_SETTINGS | TRAIN_SETTINGS:
             raise ConfigError(name, f"is not a setting{closest(name, AGENT_SETTINGS | TRAIN_SETTINGS)}")

@@ -91,6 +91,8 @@ CHOICES = {
     "actor_reduce": ("mean", "min", "first"),
 }
 
+SWITCHES = ("penalty_inside_gamma", "learn_temperature")
+
 # Limits of numbers, as (lowest, highest, what the setting takes).
 LIMITS: dict[str, tuple[float, float, str]] = {
     "penalty_coef": (0, math.inf, "a number of at least 0"),
@@ -125,7 +127,11 @@ def check_value(setting: str, value: Any) -> None:
         kinds = (int,) if "whole" in takes else (int, float)
         if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high or math.isinf(value):
             raise ConfigError(setting, f"takes {takes}, not {value!r}")
-    if setting == "hidden" and not (value and all(isinstance(w, int) and 1 <= w <= 65536 for w in value)):
+    if setting in SWITCHES and not isinstance(value, bool):
+        raise ConfigError(setting, f"takes true or false, not {value!r}")
+    if setting == "hidden" and not (
+        isinstance(value, (tuple, list)) and value and all(type(w) is int and 1 <= w <= 65536 for w in value)
+    ):
         raise ConfigError(setting, f"takes layer widths, whole numbers from 1 to 65536 as in 256,256, not {value!r}")
 
 
@@ -145,7 +151,8 @@ def check(config: Config) -> None:
         refuse(agent.penalty_coef > 0, "penalty_coef", message)
     else:
         refuse(n < 2, "ensemble_size", f"takes at least 2 for {config.algo}: one critic alone has no disagreement")
-        refuse(agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
+    # Without a penalty too: the disagreement is reported, unless there is one critic alone.
+    refuse(n > 1 and agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
     if agent.reduce == "subset_min":
         refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
     refuse(

@@ -1,0 +1,263 @@
+"""The training program: counters, seeds, compilations, what the compiled text holds, learning on known values."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_envs
+import pytest
+
+from sqt_jax import algorithms, train
+from sqt_jax.algorithms import ALGORITHMS
+
+TINY = {
+    "steps": 400,
+    "warmup_steps": 40,
+    "batch_size": 16,
+    "hidden": (16, 16),
+    "eval_every": 100,
+    "eval_episodes": 2,
+    "gamma": 0.9,
+}
+PENALISED = [name for name, row in ALGORITHMS.items() if row.settings.get("penalty", "none") != "none"]
+
+
+def make(algo, env=None, **settings):
+    config = algorithms.make_config(algo, "cheetah", **TINY | settings)
+    trainer = algorithms.make_trainer(config, env or probe_envs.one_step())
+    return config, trainer, train.make_sweep(trainer)
+
+
+def start(config, sweep, seeds=(0, 1, 2), **swept):
+    keys = jax.vmap(jax.random.key)(jnp.array(seeds, jnp.uint32))
+    scalars = jax.tree.map(lambda value: jnp.full(len(seeds), value), config.agent.scalars())
+    return sweep.init(keys, scalars._replace(**{name: jnp.array(values) for name, values in swept.items()}))
+
+
+def numbers(tree):
+    """Leaves as NumPy arrays, keys as the integers they hold."""
+    return [
+        np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+        for leaf in jax.tree.leaves(tree)
+    ]
+
+
+def identical(a, b):
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(numbers(a), numbers(b), strict=True))
+
+
+@pytest.fixture(scope="module")
+def td3():
+    return make("td3")
+
+
+def test_warmup_makes_steps_and_no_updates(td3):
+    config, _, sweep = td3
+    before = start(config, sweep)
+    after, metrics = sweep.advance(start(config, sweep), 40, False)
+    assert after.env_steps == 40 and after.agent.gradient_steps == 0 and after.replay.size == 40
+    assert identical(before.agent, after.agent)
+    assert np.isnan(metrics["critic_loss"]).all() and (metrics["train_episodes"] == 40).all()
+    actions = np.asarray(after.replay.storage[:, :40, 1])
+    assert actions.min() < -0.8 and actions.max() > 0.8  # uniform, not the policy's
+
+
+def test_training_makes_one_update_per_transition(td3):
+    config, _, sweep = td3
+    state, _ = sweep.advance(start(config, sweep), 40, False)
+    state, metrics = sweep.advance(state, 30, True)
+    assert state.env_steps == 70 and state.agent.gradient_steps == 30
+    assert all(np.isfinite(value).all() for value in metrics.values())
+
+
+def test_updates_per_step_and_num_envs_multiply():
+    config, _, sweep = make("td3", num_envs=4, updates_per_step=3)
+    state, _ = sweep.advance(start(config, sweep), 10, False)
+    assert state.env_steps == 40 and state.replay.size == 40
+    state, _ = sweep.advance(state, 5, True)
+    assert state.env_steps == 60 and state.agent.gradient_steps == 5 * 4 * 3
+
+
+def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):
+    config, _, sweep = make("td3")
+    state = start(config, sweep)
+    for steps, learn in [(7, False), (1, False), (5, True), (11, True)]:
+        state, _ = sweep.advance(state, steps, learn)
+        sweep.evaluate(state)
+    assert sweep.advance._cache_size() == 1 and sweep.evaluate._cache_size() == 1
+
+
+def test_a_sweep_over_scalars_shares_one_compilation():
+    config, _, sweep = make("td3_sqt")
+    for coef in ([0.0, 0.5, 1.0], [0.1, 0.2, 0.3]):
+        sweep.advance(start(config, sweep, penalty_coef=coef, lr=[1e-3, 1e-4, 1e-5]), 5, True)
+    assert sweep.advance._cache_size() == 1
+
+
+def test_chunks_do_not_change_the_training(td3):
+    config, _, sweep = td3
+    state, _ = sweep.advance(start(config, sweep), 40, False)
+    whole, _ = sweep.advance(state, 20, True)
+    state, _ = sweep.advance(start(config, sweep), 25, False)
+    for steps, learn in [(15, False), (3, True), (17, True)]:
+        state, _ = sweep.advance(state, steps, learn)
+    assert identical(whole._replace(episodes=None), state._replace(episodes=None))
+
+
+def test_members_differ_in_parameters_starts_and_noise(td3):
+    config, _, sweep = td3
+    state = start(config, sweep)
+    for leaf in numbers((state.agent.actor, state.agent.critic, state.timestep.obs, state.key)):
+        assert not np.array_equal(leaf[0], leaf[1])
+    state, _ = sweep.advance(state, 40, False)
+    state, _ = sweep.advance(state, 10, True)
+    actions = np.asarray(state.replay.storage[:, :50, 1])
+    assert not np.isclose(actions[0], actions[1]).any()
+
+
+def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
+    config, _, sweep = td3
+    alone, together = start(config, sweep, (3,)), start(config, sweep, (0, 1, 2, 3))
+    axes = train.member_axes(together)
+    own = jax.tree.map(
+        lambda leaf, axis: leaf if axis is None else leaf[3:], together, axes, is_leaf=lambda x: x is None
+    )
+    assert identical(alone, own)
+    alone, _ = sweep.advance(alone, 40, False)
+    together, _ = sweep.advance(together, 40, False)
+    assert np.array_equal(alone.replay.storage[0], together.replay.storage[3])
+
+
+@pytest.mark.parametrize("algo", ["td3_sqt", "sac_sqt_tuple"])
+def test_a_seed_trains_alone_as_in_a_sweep(algo):
+    config, _, sweep = make(algo)
+    results = []
+    for seeds in [(3,), (0, 1, 2, 3)]:
+        state, _ = sweep.advance(start(config, sweep, seeds), 40, False)
+        state, _ = sweep.advance(state, 100, True)
+        results.append((state.agent.critic, state.agent.actor, state.replay.storage))
+    for alone, together in zip(numbers(results[0]), numbers(results[1]), strict=True):
+        np.testing.assert_allclose(alone[0], together[3], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("algo", PENALISED)
+def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(algo):
+    plain = algo.removesuffix("_tuple").removesuffix("_sqt")
+    trained = {}
+    for name, coef in [(plain, 0.0), (algo, 0.0), (algo, 0.5)]:
+        config, _, sweep = make(name, probe_envs.constant_reward())
+        state, _ = sweep.advance(start(config, sweep, penalty_coef=[coef] * 3), 40, False)
+        state, _ = sweep.advance(state, 60, True)
+        trained[name, coef] = (state.agent.actor, state.agent.critic)
+    assert identical(trained[plain, 0.0], trained[algo, 0.0])
+    assert not identical(trained[plain, 0.0], trained[algo, 0.5])
+
+
+def test_the_same_seeds_twice_are_bit_identical(td3):
+    config, _, sweep = td3
+    runs = []
+    for _ in range(2):
+        state, _ = sweep.advance(start(config, sweep), 40, False)
+        runs.append(sweep.advance(state, 50, True))
+    assert identical(*runs)
+
+
+def test_evaluation_leaves_the_state_alone_and_draws_new_starts_each_time(td3):
+    config, _, sweep = td3
+    state, _ = sweep.advance(start(config, sweep), 40, False)
+    copy = numbers(state)
+    first = sweep.evaluate(state)
+    assert all(np.array_equal(a, b) for a, b in zip(copy, numbers(state), strict=True))
+    assert np.array_equal(first.returns, sweep.evaluate(state).returns)
+    state, _ = sweep.advance(state, 1, False)
+    assert not np.isclose(first.returns, sweep.evaluate(state).returns).any()
+
+
+def test_the_compiled_text_writes_the_replay_in_place():
+    config, _, sweep = make("td3", steps=100_000, replay_capacity=54_321)
+    text = sweep.advance.lower(start(config, sweep), 1, True).compile().as_text()
+    shape = r"f32\[3,54321,5\]"
+    made = [line for line in text.splitlines() if re.search(rf"= {shape}\S* (\w|-)+\(", line)]
+    kinds = {re.search(rf"{shape}\S* ([\w-]+)\(", line).group(1) for line in made}
+    assert "dynamic-update-slice" in kinds
+    assert kinds <= {"dynamic-update-slice", "fusion", "get-tuple-element", "parameter", "bitcast"}, kinds
+    assert len([line for line in made if " fusion(" in line]) <= 1  # the insert
+
+
+def test_the_delayed_actor_is_a_real_branch_under_vmap():
+    config, _, sweep = make("td3")
+    text = sweep.advance.lower(start(config, sweep), 1, True).compile().as_text()
+    assert "conditional(" in text
+
+
+def test_make_train_under_vmap_is_the_sweep(td3):
+    config, trainer, sweep = td3
+    run = jax.jit(jax.vmap(algorithms.make_train(config, probe_envs.one_step())))
+    keys = jax.vmap(jax.random.key)(jnp.arange(3, dtype=jnp.uint32))
+    final, history = run(keys)
+    assert history.env_steps[0].tolist() == [0, 100, 200, 300, 400]
+    assert history.returns.shape == (3, 5, 2)
+    state = start(config, sweep)
+    returns = [sweep.evaluate(state).returns]
+    for first, last in zip(range(0, 400, 100), range(100, 401, 100), strict=True):
+        for steps, learn in train.segments(first, last, config.train):
+            state, metrics = sweep.advance(state, steps, learn)
+        returns.append(sweep.evaluate(state).returns)
+    np.testing.assert_allclose(history.returns, jnp.stack(returns, 1), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(history.metrics["critic_loss"][:, -1], metrics["critic_loss"], rtol=1e-2)
+    assert np.isnan(history.metrics["critic_loss"][:, 0]).all()
+    assert (final.env_steps == 400).all()
+
+
+def test_evaluation_steps_and_segments():
+    config = algorithms.make_config("td3", "cheetah").train
+    stops = train.evaluation_steps(config)
+    assert len(stops) == 201 and stops[:2] == [0, 5000] and stops[-1] == 1_000_000
+    assert train.segments(20_000, 25_000, config) == [(5000, False)]
+    assert train.segments(25_000, 30_000, config) == [(5000, True)]
+    odd = algorithms.make_config(
+        "td3", "cheetah", steps=30_000, warmup_steps=7_000, eval_every=20_000, num_envs=2
+    ).train
+    assert train.evaluation_steps(odd) == [0, 20_000, 30_000]
+    assert train.segments(0, 20_000, odd) == [(3500, False), (6500, True)]
+
+
+def test_memory_estimate_is_the_size_of_what_is_held():
+    config, _, sweep = make("td3")
+    state = start(config, sweep)
+    agent = sum(leaf.nbytes for leaf in numbers(state.agent))
+    estimate = algorithms.memory_estimate(config, 3, probe_envs.one_step())
+    assert estimate == pytest.approx(state.replay.storage.nbytes + 2 * agent, rel=0.01)
+
+
+LEARN = {"steps": 3000, "warmup_steps": 200, "batch_size": 64, "hidden": (32, 32), "lr": 1e-3, "tau": 0.05}
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
+    """On `one_step` the best action is obs and Q*(obs, obs) = obs, whatever the penalty: every step is terminal."""
+    env = probe_envs.one_step()
+    config, _, sweep = make(algo, env, **LEARN, temperature=0.01)
+    state, _ = sweep.advance(start(config, sweep), 200, False)
+    state, metrics = sweep.advance(state, 2800, True)
+    obs = jnp.linspace(-0.4, 0.4, 5)[:, None]
+    agent = algorithms.make_agent(config, env)
+    axes = train.member_axes(state.agent)
+    act = jax.vmap(lambda s: agent.act(s, obs, jax.random.key(0), deterministic=True), in_axes=(axes,))
+    np.testing.assert_allclose(np.median(act(state.agent), axis=0), obs, atol=0.1)
+    assert (metrics["train_length"] == 1).all()
+
+
+@pytest.mark.parametrize("algo", ["td3", "sac"])
+def test_truncation_bootstraps_and_termination_does_not(algo):
+    """Endless reward 1 is worth 1 / (1 - gamma) where only the time limit ends episodes; 3 steps of it 1 + g + g²."""
+    values = {}
+    for name, env in [("endless", probe_envs.constant_reward()), ("three", probe_envs.countdown(3))]:
+        config, _, sweep = make(algo, env, **LEARN | {"tau": 0.1}, temperature=0.001)
+        state, _ = sweep.advance(start(config, sweep), 200, False)
+        state, _ = sweep.advance(state, 2500, True)
+        state, metrics = sweep.advance(state, 300, True)
+        values[name] = np.median(metrics["q_mean"])
+    assert values["endless"] == pytest.approx(10, rel=0.1)
+    assert values["three"] == pytest.approx((1 + 1.9 + 2.71) / 3, rel=0.1)  # the mean over the three states
