@@ -13,10 +13,10 @@ run: $(STAMP)  ## SAC with SQT on Ant, five seeds, on a small budget: about five
 	$(BIN)/python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4 --preset=quick
 
 test: $(STAMP)  ## all tests but the slow ones
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-all: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

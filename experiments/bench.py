@@ -97,7 +97,7 @@ def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
     """Updates on one fixed batch: the learner alone, without environment and replay."""
     config = algorithms.make_config(algo, task)
     env = envs.make(task)
-    agent = algorithms.make_agent(config, env)
+    agent = algorithms.agent_of(config, env)
     size = config.train.batch_size
 
     def random_batch(key):

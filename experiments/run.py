@@ -24,6 +24,7 @@ from experiments.presets import preset_settings
 from sqt_jax import envs
 from sqt_jax.algorithms import make_config, make_trainer, memory_estimate
 from sqt_jax.config import ConfigError
+from sqt_jax.policy import save_policy
 from sqt_jax.train import evaluation_steps, make_sweep
 from sqt_jax.types import Environment, Scalars
 
@@ -118,6 +119,7 @@ def run(plan: Plan, command: Sequence[str]) -> int:
             outcome = train_loop(
                 sweep, state, train, len(members), report=files.report, display=display, stop=lambda: bool(stop)
             )
+        save_policy(plan.path / "policy", config, env, outcome.state.agent)
         summary = files.summary(outcome)
         table = records.read_evaluations(plan.path / "evaluations.csv")
         if len(table["member"]):

@@ -13,7 +13,7 @@ import jax
 
 from sqt_jax import envs, replay, train
 from sqt_jax.agents import sac, td3
-from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check
+from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check_agent, check_train
 from sqt_jax.types import Agent, Environment, Replay
 
 
@@ -47,8 +47,31 @@ def closest(name: str, names: Iterable[str]) -> str:
     return f" (did you mean {match[0]}?)" if match else ""
 
 
+def _refuse_unknown(settings: Iterable[str], known: Iterable[str]) -> None:
+    for name in settings:
+        if name not in known:
+            raise ConfigError(name, f"is not a setting{closest(name, known)}")
+
+
+def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
+    """An agent's checked settings: the defaults, then the algorithm's row, then `settings`.
+
+    Raises:
+      ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
+    """
+    if algo not in ALGORITHMS:
+        names = ", ".join(ALGORITHMS)
+        raise ConfigError("algo", f"takes one of {names}, not {algo!r}{closest(str(algo), ALGORITHMS)}")
+    _refuse_unknown(settings, AGENT_SETTINGS)
+    if isinstance(settings.get("hidden"), list):  # out of a JSON file
+        settings["hidden"] = tuple(settings["hidden"])
+    config = AgentConfig(**ALGORITHMS[algo].settings | settings)
+    check_agent(algo, config)
+    return config
+
+
 def make_config(algo: str, env: str, **settings: Any) -> Config:
-    """A checked configuration: the defaults, then the algorithm's row, then `settings`.
+    """A whole experiment's checked settings.
 
     Args:
       algo: a name of `ALGORITHMS`.
@@ -58,41 +81,49 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     Raises:
       ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
     """
-    if algo not in ALGORITHMS:
-        raise ConfigError("algo", f"takes one of {', '.join(ALGORITHMS)}, not {algo!r}{closest(algo, ALGORITHMS)}")
+    physics = settings.pop("physics", Config.physics)
+    training = {name: settings.pop(name) for name in TRAIN_SETTINGS & settings.keys()}
+    if algo in ALGORITHMS:
+        _refuse_unknown(settings, AGENT_SETTINGS | TRAIN_SETTINGS)
+    agent = make_agent_config(algo, **settings)
     try:
         env = envs.resolve(env)
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
-    physics = settings.pop("physics", Config.physics)
     if physics not in envs.PHYSICS:
         raise ConfigError("physics", f"takes one of {', '.join(envs.PHYSICS)}, not {physics!r}")
-    if isinstance(settings.get("hidden"), list):  # out of a JSON file
-        settings["hidden"] = tuple(settings["hidden"])
-    for name in settings:
-        if name not in AGENT_SETTINGS | TRAIN_SETTINGS:
-            raise ConfigError(name, f"is not a setting{closest(name, AGENT_SETTINGS | TRAIN_SETTINGS)}")
-    agent = ALGORITHMS[algo].settings | {k: v for k, v in settings.items() if k in AGENT_SETTINGS}
-    training = {k: v for k, v in settings.items() if k in TRAIN_SETTINGS}
-    config = Config(algo, env, physics, AgentConfig(**agent), TrainConfig(**training))
-    check(config)
-    return config
+    train_config = TrainConfig(**training)
+    check_train(train_config)
+    return Config(algo, env, physics, agent, train_config)
 
 
-def make_agent(config: Config, env: Environment) -> Agent:
-    """The agent of a configuration, for an environment's sizes."""
+def make_agent(algo: str, observation_size: int, action_size: int, **settings: Any) -> Agent:
+    """An algorithm's `init`, `act` and `update` alone, for a loop and an environment of your own.
+
+    Args:
+      **settings: fields of `AgentConfig` by name.
+
+    Raises:
+      ConfigError: as `make_agent_config`.
+    """
+    config = make_agent_config(algo, **settings)
+    return ALGORITHMS[algo].make_agent(config, observation_size, action_size)
+
+
+def agent_of(config: Config, env: Environment) -> Agent:
+    """The agent of an experiment, for an environment's sizes."""
     return ALGORITHMS[config.algo].make_agent(config.agent, env.observation_size, env.action_size)
 
 
-def make_replay(config: Config, env: Environment) -> Replay:
-    """The replay buffer of a configuration, for an environment's sizes."""
+def replay_of(config: Config, env: Environment) -> Replay:
+    """The replay buffer of an experiment, for an environment's sizes."""
     return replay.uniform(config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
 
 
 def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:
     """Training of one member as pure functions; `env` takes the place of the named environment."""
     env = env or envs.make(config.env, config.physics)
-    return train.make_trainer(make_agent(config, env), env, make_replay(config, env), config.train)
+    return train.make_trainer(agent_of(config, env), env, replay_of(config, env), config.train)
 
 
 def make_train(config: Config, env: Environment | None = None) -> Callable[..., tuple[train.TrainState, train.History]]:
@@ -112,6 +143,4 @@ def memory_estimate(config: Config, num_members: int, env: Environment | None = 
             math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(jax.eval_shape(function, *args))
         )
 
-    return num_members * (
-        size(make_replay(config, env).init) + 2 * size(make_agent(config, env).init, jax.random.key(0))
-    )
+    return num_members * (size(replay_of(config, env).init) + 2 * size(agent_of(config, env).init, jax.random.key(0)))

@@ -135,35 +135,39 @@ def check_value(setting: str, value: Any) -> None:
         raise ConfigError(setting, f"takes layer widths, whole numbers from 1 to 65536 as in 256,256, not {value!r}")
 
 
-def check(config: Config) -> None:
-    """Raises ConfigError where settings cannot be, alone or together."""
-    for name, value in config.flat().items():
+def _refuse(wrong: bool, setting: str, message: str) -> None:
+    if wrong:
+        raise ConfigError(setting, message)
+
+
+def check_agent(algo: str, agent: AgentConfig) -> None:
+    """Raises ConfigError where an agent's settings cannot be, alone or together."""
+    for name, value in dataclasses.asdict(agent).items():
         check_value(name, value)
-    agent, train = config.agent, config.train
-
-    def refuse(wrong: bool, setting: str, message: str) -> None:
-        if wrong:
-            raise ConfigError(setting, message)
-
     n = agent.ensemble_size
     if agent.penalty == "none":
-        message = f"takes 0 for {config.algo}, which has no penalty (its _sqt and _sqt_tuple forms have one)"
-        refuse(agent.penalty_coef > 0, "penalty_coef", message)
+        message = f"takes 0 for {algo}, which has no penalty (its _sqt and _sqt_tuple forms have one)"
+        _refuse(agent.penalty_coef > 0, "penalty_coef", message)
     else:
-        refuse(n < 2, "ensemble_size", f"takes at least 2 for {config.algo}: one critic alone has no disagreement")
+        _refuse(n < 2, "ensemble_size", f"takes at least 2 for {algo}: one critic alone has no disagreement")
     # Without a penalty too: the disagreement is reported, unless there is one critic alone.
-    refuse(n > 1 and agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
+    _refuse(n > 1 and agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
     if agent.reduce == "subset_min":
-        refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
-    refuse(
-        agent.learn_temperature and agent.temperature <= 0, "temperature", "takes a positive start where it is learned"
-    )
-    refuse(
+        _refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
+    if agent.learn_temperature:
+        _refuse(agent.temperature <= 0, "temperature", "takes a positive start where it is learned")
+
+
+def check_train(train: TrainConfig) -> None:
+    """Raises ConfigError where the settings of a training run cannot be, alone or together."""
+    for name, value in dataclasses.asdict(train).items():
+        check_value(name, value)
+    _refuse(
         train.warmup_steps >= train.steps,
         "warmup_steps",
         f"takes fewer than the run's steps ({train.steps}), not {train.warmup_steps}: nothing would be learned",
     )
-    refuse(
+    _refuse(
         train.batch_size > train.capacity,
         "batch_size",
         f"takes at most the replay's capacity ({train.capacity}), not {train.batch_size}",
@@ -171,4 +175,4 @@ def check(config: Config) -> None:
     for name in ("steps", "warmup_steps", "eval_every"):
         value = getattr(train, name)
         message = f"takes a multiple of num_envs ({train.num_envs}), not {value}"
-        refuse(value % train.num_envs != 0, name, message)
+        _refuse(value % train.num_envs != 0, name, message)

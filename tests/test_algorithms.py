@@ -5,7 +5,7 @@ import pytest
 from probe_envs import constant_reward
 
 from sqt_jax.agents import sac, td3
-from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS, make_agent, make_config, make_trainer
+from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS, agent_of, make_config, make_trainer
 
 VARIANTS = {"": ("none", 0.0), "_sqt": ("batch_std", 0.5), "_sqt_tuple": ("transition_std", 0.1)}
 
@@ -38,7 +38,7 @@ def test_settings_override_the_row():
 def test_an_environment_of_ones_own_gives_the_sizes(algo):
     env = constant_reward()
     config = make_config(algo, "ant", hidden=(5,), ensemble_size=3, replay_capacity=300)
-    agent = jax.eval_shape(make_agent(config, env).init, jax.random.key(0))
+    agent = jax.eval_shape(agent_of(config, env).init, jax.random.key(0))
     assert jax.tree.leaves(agent.critic)[1].shape == (3, env.observation_size + env.action_size, 5)
     state = jax.eval_shape(make_trainer(config, env).init, jax.random.key(0))
     assert jax.tree.structure(state.agent) == jax.tree.structure(agent)

@@ -15,7 +15,7 @@ from sqt_jax.algorithms import ALGORITHMS
 def saved(algo, directory, members=2):
     env = probe_envs.constant_reward()
     config = algorithms.make_config(algo, "cheetah", hidden=(8, 8))
-    agent = algorithms.make_agent(config, env)
+    agent = algorithms.agent_of(config, env)
     state = jax.vmap(agent.init)(jax.random.split(jax.random.key(1), members))
     policy.save_policy(directory, config, env, state)
     return agent, state

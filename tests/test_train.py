@@ -242,7 +242,7 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     state, _ = sweep.advance(start(config, sweep), 200, False)
     state, metrics = sweep.advance(state, 2800, True)
     obs = jnp.linspace(-0.4, 0.4, 5)[:, None]
-    agent = algorithms.make_agent(config, env)
+    agent = algorithms.agent_of(config, env)
     axes = train.member_axes(state.agent)
     act = jax.vmap(lambda s: agent.act(s, obs, jax.random.key(0), deterministic=True), in_axes=(axes,))
     np.testing.assert_allclose(np.median(act(state.agent), axis=0), obs, atol=0.1)

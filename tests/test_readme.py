@@ -1,0 +1,51 @@
+"""What the README shows works: its Python runs, its commands are understood."""
+
+import re
+import shlex
+from pathlib import Path
+
+import probe_envs
+import pytest
+
+from experiments import flags, run
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+BLOCKS = re.findall(r"```(\w+)( continued)?\n(.*?)```", README, re.DOTALL)
+PYTHON = [code for language, continued, code in BLOCKS if language == "python" and not continued]
+COMMANDS = [
+    shlex.split(line, comments=True)[2:]
+    for language, _, code in BLOCKS
+    if language == "sh"
+    for line in code.splitlines()
+    if " -m experiments.run " in line
+]
+
+
+@pytest.mark.parametrize("code", PYTHON, ids=lambda code: code.splitlines()[0])
+def test_python_examples_run(code):
+    exec(compile(code, "README.md", "exec"), {})
+
+
+@pytest.mark.parametrize("argv", COMMANDS, ids=lambda argv: " ".join(argv[1:3]))
+def test_commands_are_understood(argv, tmp_path):
+    options = flags.parse([*argv, f"--out={tmp_path}", "--replay_capacity=1000"])
+    assert run.make_plan(options).members
+
+
+def test_the_readme_has_them():
+    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4
+
+
+def test_a_policy_of_a_run_loads_as_shown(tmp_path):
+    """The example marked `continued`, on a tiny run."""
+    argv = ["run", "--algo=td3", "--env=cheetah", "--seeds=0", "--steps=60", "--warmup_steps=20", "--batch_size=8"]
+    argv += ["--hidden=8", "--eval_every=60", "--eval_episodes=1", f"--out={tmp_path}", "--name=tiny", "--quiet"]
+    assert run.main(argv, env=probe_envs.constant_reward()) == 0
+    import jax.numpy as jnp
+
+    import sqt_jax
+
+    names = {"run": tmp_path / "cheetah" / "td3" / "tiny", "obs": jnp.zeros((4, 2)), "sqt_jax": sqt_jax}
+    (code,) = [code for _, continued, code in BLOCKS if continued]
+    exec(code, names)
+    assert names["action"].shape == (4, 1)
