@@ -15,8 +15,8 @@ run: $(STAMP)  ## SAC with SQT on Ant, five seeds, on a small budget: about five
 test: $(STAMP)  ## all tests but the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
-test-all: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test-all: $(STAMP)  ## all tests, compiled as users' programs are
+	XLA_FLAGS= $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

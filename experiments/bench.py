@@ -29,7 +29,7 @@ from sqt_jax.types import Array, Transition
 SUITES = ("env", "update", "replay", "loop")
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
-flags.DEFINE_list("tasks", list(envs.TASKS), "Tasks of the suites env and loop; the first one's sizes for the others.")
+flags.DEFINE_list("tasks", list(envs.TASKS), "Tasks; the suite replay takes the rows of the first one.")
 flags.DEFINE_list("algos", ["td3", "sac"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
@@ -141,7 +141,7 @@ def bench_replay(what: str, task: str, capacity: int, members: int, **timing: An
 
     def sample(carry, key):
         state, total = carry
-        return state, total + jnp.sum(store.sample(state, key).obs)
+        return state, total + jnp.sum(store.sample(state, key)[0].obs)
 
     step = jax.vmap({"insert": insert, "sample": sample}[what], in_axes=((axes, 0), 0), out_axes=(axes, 0))
 
@@ -172,7 +172,10 @@ def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
     sweep = train.make_sweep(algorithms.make_trainer(config))
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
-    state, _ = sweep.advance(state, 300, False)
+    start = time.perf_counter()
+    state, _ = jax.block_until_ready(sweep.advance(state, 1, False))
+    compile_seconds = time.perf_counter() - start
+    state, _ = sweep.advance(state, 299, False)
 
     def once(steps):
         nonlocal state
@@ -180,9 +183,6 @@ def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
         return metrics
 
     rate, _ = measure(once, **timing)
-    start = time.perf_counter()  # `advance` has run before: compile it once more, for the figure
-    sweep.advance.lower(state, 1, True).compile()  # type: ignore[attr-defined]
-    compile_seconds = time.perf_counter() - start
     return Row("loop", f"{algo} on {task}", members, "env steps", rate * members, compile_seconds)
 
 
@@ -194,7 +194,7 @@ def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
             if suite == "env":
                 yield from (bench_env(task, count, **timing) for task in tasks)
             elif suite == "update":
-                yield from (bench_update(algo, tasks[0], count, **timing) for algo in algos)
+                yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
             elif suite == "replay":
                 yield from (
                     bench_replay(what, tasks[0], int(size), count, **timing)
@@ -229,6 +229,7 @@ def main(argv: Sequence[str]) -> None:
     if unknown:
         sys.exit(f"--suites: takes some of {', '.join(SUITES)}, not {unknown[0]!r}")
     runtime.prepare()
+    jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     console = Console()
     console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
     found = []

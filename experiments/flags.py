@@ -6,7 +6,6 @@ the settings are `sqt_jax.algorithms.make_config`'s.
 """
 
 import dataclasses
-import difflib
 import math
 import re
 import textwrap
@@ -17,6 +16,7 @@ from absl import flags as absl_flags
 
 from experiments.presets import PRESETS
 from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check_value
+from sqt_jax.names import nearest
 from sqt_jax.types import Scalars
 
 EXAMPLE = "python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4"
@@ -46,17 +46,37 @@ SETTING_HELP = {
     "tau": "step of the target networks",
     "policy_delay": "critic updates per actor update",
     "actor_reduce": "what the actor maximises of the critics: mean, min or first",
-    "exploration_noise": "TD3: std of the noise on actions",
-    "target_noise": "TD3: std of the noise on target actions",
-    "target_noise_clip": "TD3: limit of that noise",
+    "exploration_noise": "TD3, TD7: std of the noise on actions",
+    "target_noise": "TD3, TD7: std of the noise on target actions",
+    "target_noise_clip": "TD3, TD7: limit of that noise",
     "temperature": "SAC: weight of the entropy; 'auto' learns it",
+    "embedding_size": "size of the state and state-action embeddings",
+    "target_update_period": "updates between copies into the target networks",
+    "priority_exponent": "replay: a transition's priority is its TD error to this power",
+    "min_priority": "TD error below which all priorities are equal and the critics' loss is quadratic",
+    "checkpoint_switch": "updates after which a policy is assessed by several episodes instead of one",
+    "assessment_episodes": "episodes of an assessment from then on",
+    "checkpoint_reset_weight": "factor of the best assessment so far at that switch",
 }
+# The settings that td7 alone has, in a group of their own.
+TD7_SETTINGS = (
+    "embedding_size",
+    "target_update_period",
+    "priority_exponent",
+    "min_priority",
+    "checkpoint_switch",
+    "assessment_episodes",
+    "checkpoint_reset_weight",
+)
 # Chosen by --algo and by --temperature=auto, or not a setting of its own.
 NOT_FLAGS = ("penalty", "learn_temperature", "algo", "env", "agent", "train")
 # Where the algorithms' own defaults differ from the dataclass's.
 DEFAULT_TEXT = {
     "penalty_coef": "0.5 with _sqt, 0.1 with _sqt_tuple",
-    "policy_delay": "2 for td3, 1 for sac",
+    "policy_delay": "2; 1 for sac and redq",
+    "ensemble_size": "2; 4 for maxmin, 10 for redq",
+    "reduce": "min; subset_min for redq",
+    "updates_per_step": "1; 5 for redq",
 }
 
 
@@ -142,7 +162,13 @@ def _settings(config: type) -> list[_Flag]:
 
 FLAGS: dict[str, list[_Flag]] = {
     "What to run": [
-        _Flag("algo", str, "a name", "algorithm: td3 or sac, alone or with _sqt or _sqt_tuple", "required"),
+        _Flag(
+            "algo",
+            str,
+            "a name",
+            "algorithm: td3, sac or td7, alone or with _sqt or _sqt_tuple; maxmin or redq, alone or with _sqt",
+            "required",
+        ),
         _Flag("env", str, "a name", "environment: cheetah, walker, ant or humanoid", "required"),
         *_settings(Config),
         _Flag(
@@ -155,7 +181,10 @@ FLAGS: dict[str, list[_Flag]] = {
         _Flag("preset", str, f"one of {', '.join(PRESETS)}", "bundle of settings; flags win over it", "paper"),
     ],
     "Training": _settings(TrainConfig),
-    "Algorithm (the scalars " + ", ".join(Scalars._fields) + " take lists)": _settings(AgentConfig),
+    "Algorithm (the scalars " + ", ".join(Scalars._fields) + " take lists)": [
+        flag for flag in _settings(AgentConfig) if flag.name not in TD7_SETTINGS
+    ],
+    "TD7": [flag for flag in _settings(AgentConfig) if flag.name in TD7_SETTINGS],
     "Output": [
         _Flag("out", str, "a folder", "results go to OUT/ENV/ALGO/NAME/", "runs"),
         _Flag("name", str, "a word", "name of the run", "settings that differ from the defaults, and the time"),
@@ -193,8 +222,7 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     try:
         rest = values(list(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
-        close = difflib.get_close_matches(error.flagname, [flag.name for flag in known], n=1)
-        hint = f"; did you mean --{close[0]}?" if close else "; --help lists the flags"
+        hint = nearest(error.flagname, [flag.name for flag in known]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
     except (absl_flags.Error, ValueError) as error:
         text = str(error).removeprefix("flag ").removeprefix("ERROR:: ")
@@ -231,7 +259,9 @@ def parse(argv: Sequence[str]) -> Options | None:
     if name is not None and (
         name in ("", ".", "..") or set(name) & set("/\\") or not name.isprintable() or len(name.encode()) > 200
     ):
-        raise UsageError(f"--name={name[:40]}: takes up to 200 bytes without slashes: it becomes a folder's name")
+        raise UsageError(
+            f"--name={name[:40]}: takes up to 200 bytes, no slashes or control characters: it names a folder"
+        )
     if own["out"] == "":
         raise UsageError("--out=: takes a folder")
 

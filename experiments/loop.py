@@ -159,11 +159,16 @@ def train_loop(
         evaluation = sweep.evaluate(state)
         returns, lengths = np.asarray(evaluation.returns), np.asarray(evaluation.lengths)
         pace.evaluated(clock() - start)
-        last_return = float(returns.mean())
+        bad = find_diverged(metrics, returns)
+        # An environment takes a NaN action as the end of the episode: what a diverged member returns says nothing.
+        returns = np.where(bad[:, None], np.nan, returns)
+        if not bad.all():
+            last_return = float(np.nanmean(returns))
         send(metrics, returns, lengths)
-        display.evaluated(done, returns.mean(axis=1))
+        display.evaluated(done, returns[~bad].mean(axis=1))
 
-    def send(metrics: dict[str, np.ndarray], returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
+    def find_diverged(metrics: dict[str, np.ndarray], returns: np.ndarray | None) -> np.ndarray:
+        """[S] bool; members that were not known to be are announced."""
         # NaN metrics are those not measured; a NaN loss is seen in the parameters it made.
         bad = ~np.asarray(_finite(state.agent, num_members))
         bad |= np.any([np.isinf(values) for values in metrics.values()], axis=0)
@@ -173,6 +178,9 @@ def train_loop(
             if member not in diverged:
                 diverged[member] = done
                 display.message(f"member {member} diverged: not all its numbers are finite at step {done:,}")
+        return bad
+
+    def send(metrics: dict[str, np.ndarray], returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
         report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths))
 
     for point in evaluation_steps(train):
@@ -190,6 +198,7 @@ def train_loop(
         if stop():
             interrupted = True
             if interval.sums:
+                find_diverged(interval.result(), None)
                 send(interval.result(), None, None)
             break
         evaluate_and_report(interval.result())

@@ -113,8 +113,8 @@ class Display:
         self._last_phase = status.phase
 
     def evaluated(self, env_steps: int, returns: np.ndarray) -> None:
-        """One line per evaluation. `returns`: mean return of each member, [S]."""
-        if not self.quiet:
+        """One line per evaluation. `returns`: mean return of each member that has not diverged."""
+        if not self.quiet and len(returns):
             spread = f" +- {returns.std():,.1f} over {len(returns)} members" if len(returns) > 1 else ""
             self._line(f"step {env_steps:>9,}: return {returns.mean():,.1f}{spread}")
 
@@ -144,7 +144,11 @@ def final_table(summary: Mapping[str, Any], swept: Sequence[str]) -> Table:
         return "-" if value is None else f"{value:,.{digits}f}"
 
     columns = ["penalty_coef", *swept]
-    table = Table(box=SIMPLE_HEAD, show_footer=False)
+    table = Table(
+        box=SIMPLE_HEAD,
+        show_footer=False,
+        caption="last rows: the mean over seeds, at the end and at its best evaluation (the paper's score)",
+    )
     for name in ("member", "seed", *columns, "final return", "best return", "q_std"):
         table.add_column(name, justify="right")
     diverged = {entry["member"]: entry["env_steps"] for entry in summary["diverged"]}

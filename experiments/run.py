@@ -3,6 +3,7 @@
 Exit codes: 0 done; 2 bad usage (one line, nothing written); 3 a member diverged; 130 interrupted.
 """
 
+import re
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -57,7 +58,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         default = make_config(options.algo, options.env)
         settings = preset_settings(options.preset, default.algo, default.env) | options.settings
         configs = [
-            make_config(options.algo, options.env, **settings, **dict(zip(options.sweep, values, strict=True)))
+            make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
     except ConfigError as error:
@@ -102,7 +103,7 @@ def run(plan: Plan, command: Sequence[str]) -> int:
         files.config(records.describe(members, plan.swept, command, options.preset))
         if not options.quiet:
             title = f"{config.algo} on {config.env}, members: {len(members)} -> {plan.path}"
-            console.print(title, soft_wrap=True, highlight=False)
+            console.print(title, soft_wrap=True, highlight=False, markup=False)
             evaluations = len(evaluation_steps(train))
             share = progress.evaluation_share(train.steps, evaluations, train.eval_episodes, env.episode_length)
             console.print(share, soft_wrap=True, highlight=False)
@@ -119,8 +120,8 @@ def run(plan: Plan, command: Sequence[str]) -> int:
             outcome = train_loop(
                 sweep, state, train, len(members), report=files.report, display=display, stop=lambda: bool(stop)
             )
-        save_policy(plan.path / "policy", config, env, outcome.state.agent)
         summary = files.summary(outcome)
+        save_policy(plan.path / "policy", config, env, outcome.state.agent)
         table = records.read_evaluations(plan.path / "evaluations.csv")
         if len(table["member"]):
             plots.draw_curves(table, plan.path / "curves.png", f"{config.algo} on {config.env}")
@@ -132,7 +133,7 @@ def run(plan: Plan, command: Sequence[str]) -> int:
             f"{summary['status']} after {progress.format_seconds(outcome.wall_seconds)}{rate}", highlight=False
         )
         if len(table["member"]):
-            console.print(f"curves: {plan.path / 'curves.png'}", soft_wrap=True, highlight=False)
+            console.print(f"curves: {plan.path / 'curves.png'}", soft_wrap=True, highlight=False, markup=False)
     return INTERRUPTED if outcome.interrupted else DIVERGED if outcome.diverged else DONE
 
 
@@ -167,7 +168,7 @@ def _stop_on_signal() -> Iterator[list[int]]:
     def handle(number: int, _: FrameType | None) -> None:
         received.append(number)
         restore()
-        print("stopping after this chunk of training (again: at once)", file=sys.stderr)
+        print("stopping when the running chunk of training or evaluation ends", file=sys.stderr)
 
     for number in numbers:
         signal.signal(number, handle)
@@ -199,7 +200,10 @@ def _free_memory() -> int:
     free = psutil.virtual_memory().available
     try:
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        return free if limit == "max" else min(free, int(limit))
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+        cached = re.search(r"^inactive_file (\d+)$", Path("/sys/fs/cgroup/memory.stat").read_text(), re.MULTILINE)
+        reclaimable = int(cached[1]) if cached else 0
+        return free if limit == "max" else min(free, int(limit) - used + reclaimable)
     except OSError:
         return free
 

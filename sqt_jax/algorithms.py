@@ -4,16 +4,17 @@ A variant is a row: a base algorithm and the settings in which it differs.
 """
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 
-from sqt_jax import envs, replay, train
-from sqt_jax.agents import sac, td3
+from sqt_jax import envs, lap, replay, train
+from sqt_jax.agents import sac, td3, td7
 from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check_agent, check_train
+from sqt_jax.names import nearest, unknown
 from sqt_jax.types import Agent, Environment, Replay
 
 
@@ -22,35 +23,70 @@ class Algorithm(NamedTuple):
 
     make_agent: Callable[[AgentConfig, int, int], Agent]  # (config, observation size, action size)
     settings: dict[str, Any]  # where the row differs from AgentConfig's defaults
+    training: Mapping[str, Any] = MappingProxyType({})  # and from TrainConfig's
+    ignores: frozenset[str] = frozenset()  # settings that have no effect
+    prioritised: bool = False  # LAP instead of uniform replay
+    single_env: bool = False  # one environment per member: its assessments belong to one stream of episodes
 
+
+TEMPERATURE = frozenset({"temperature", "learn_temperature"})
+NOISE = frozenset({"exploration_noise", "target_noise", "target_noise_clip"})
+SALE_AND_LAP = frozenset(
+    {
+        "embedding_size",
+        "target_update_period",
+        "priority_exponent",
+        "min_priority",
+        "checkpoint_switch",
+        "assessment_episodes",
+        "checkpoint_reset_weight",
+    }
+)
 
 SQT = {"penalty": "batch_std", "penalty_coef": 0.5}
 SQT_TUPLE = {"penalty": "transition_std", "penalty_coef": 0.1}
 TD3 = {"policy_delay": 2}
+TD7 = {"policy_delay": 2}
+MAXMIN = {"ensemble_size": 4}  # https://arxiv.org/abs/2002.06487
+REDQ = {"ensemble_size": 10, "reduce": "subset_min", "subset_size": 2}  # https://arxiv.org/abs/2101.05982
+
+
+def _td3(settings: dict[str, Any]) -> Algorithm:
+    return Algorithm(td3.make, TD3 | settings, ignores=TEMPERATURE | SALE_AND_LAP)
+
+
+def _sac(settings: dict[str, Any], **training: Any) -> Algorithm:
+    return Algorithm(sac.make, settings, training, ignores=NOISE | SALE_AND_LAP)
+
+
+def _td7(settings: dict[str, Any]) -> Algorithm:
+    return Algorithm(td7.make, TD7 | settings, ignores=TEMPERATURE | {"tau"}, prioritised=True, single_env=True)
+
 
 ALGORITHMS: dict[str, Algorithm] = {
-    "td3": Algorithm(td3.make, TD3),
-    "td3_sqt": Algorithm(td3.make, TD3 | SQT),
-    "td3_sqt_tuple": Algorithm(td3.make, TD3 | SQT_TUPLE),
-    "sac": Algorithm(sac.make, {}),
-    "sac_sqt": Algorithm(sac.make, SQT),
-    "sac_sqt_tuple": Algorithm(sac.make, SQT_TUPLE),
+    "td3": _td3({}),
+    "td3_sqt": _td3(SQT),
+    "td3_sqt_tuple": _td3(SQT_TUPLE),
+    "sac": _sac({}),
+    "sac_sqt": _sac(SQT),
+    "sac_sqt_tuple": _sac(SQT_TUPLE),
+    "td7": _td7({}),
+    "td7_sqt": _td7(SQT),
+    "td7_sqt_tuple": _td7(SQT_TUPLE),
+    "maxmin": _td3(MAXMIN),
+    "maxmin_sqt": _td3(MAXMIN | SQT),
+    "redq": _sac(REDQ, updates_per_step=5),
+    "redq_sqt": _sac(REDQ | SQT, updates_per_step=5),
 }
 
 AGENT_SETTINGS = frozenset(field.name for field in dataclasses.fields(AgentConfig))
 TRAIN_SETTINGS = frozenset(field.name for field in dataclasses.fields(TrainConfig))
 
 
-def closest(name: str, names: Iterable[str]) -> str:
-    """' (did you mean X?)' where something similar exists, else nothing."""
-    match = difflib.get_close_matches(name, list(names), n=1)
-    return f" (did you mean {match[0]}?)" if match else ""
-
-
 def _refuse_unknown(settings: Iterable[str], known: Iterable[str]) -> None:
     for name in settings:
         if name not in known:
-            raise ConfigError(name, f"is not a setting{closest(name, known)}")
+            raise ConfigError(name, f"is not a setting{nearest(name, known)}")
 
 
 def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
@@ -60,12 +96,14 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
       ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
     """
     if algo not in ALGORITHMS:
-        names = ", ".join(ALGORITHMS)
-        raise ConfigError("algo", f"takes one of {names}, not {algo!r}{closest(str(algo), ALGORITHMS)}")
+        raise ConfigError("algo", unknown(algo, ALGORITHMS))
     _refuse_unknown(settings, AGENT_SETTINGS)
     if isinstance(settings.get("hidden"), list):  # out of a JSON file
         settings["hidden"] = tuple(settings["hidden"])
     config = AgentConfig(**ALGORITHMS[algo].settings | settings)
+    for name in ALGORITHMS[algo].ignores & settings.keys():
+        if settings[name] != getattr(AgentConfig, name):  # the default may be named: config.json names everything
+            raise ConfigError(name.removeprefix("learn_"), f"has no effect with {algo}")
     check_agent(algo, config)
     return config
 
@@ -91,9 +129,11 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
     if physics not in envs.PHYSICS:
-        raise ConfigError("physics", f"takes one of {', '.join(envs.PHYSICS)}, not {physics!r}")
-    train_config = TrainConfig(**training)
+        raise ConfigError("physics", unknown(physics, envs.PHYSICS))
+    train_config = TrainConfig(**{**ALGORITHMS[algo].training, **training})
     check_train(train_config)
+    if ALGORITHMS[algo].single_env and train_config.num_envs > 1:
+        raise ConfigError("num_envs", f"takes 1 for {algo}, whose policies are assessed one episode after another")
     return Config(algo, env, physics, agent, train_config)
 
 
@@ -117,7 +157,11 @@ def agent_of(config: Config, env: Environment) -> Agent:
 
 def replay_of(config: Config, env: Environment) -> Replay:
     """The replay buffer of an experiment, for an environment's sizes."""
-    return replay.uniform(config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
+    sizes = (config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
+    if not ALGORITHMS[config.algo].prioritised:
+        return replay.uniform(*sizes)
+    agent = config.agent
+    return lap.lap(*sizes, agent.priority_exponent, agent.min_priority, agent.target_update_period)
 
 
 def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:

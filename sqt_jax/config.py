@@ -45,6 +45,14 @@ class AgentConfig:
     # SAC's temperature.
     temperature: float = 0.2
     learn_temperature: bool = False
+    # TD7's.
+    embedding_size: int = 256  # Z of zs and zsa
+    target_update_period: int = 250  # updates between hard copies
+    priority_exponent: float = 0.4
+    min_priority: float = 1.0
+    checkpoint_switch: int = 750_000  # gradient steps after which an assessment takes `assessment_episodes`
+    assessment_episodes: int = 20
+    checkpoint_reset_weight: float = 0.9  # what the best minimum return is multiplied with at the switch
 
     def scalars(self) -> Scalars:
         return Scalars(**{name: getattr(self, name) for name in Scalars._fields})
@@ -107,6 +115,13 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "target_noise": (0, math.inf, "a number of at least 0"),
     "target_noise_clip": (0, math.inf, "a number of at least 0"),
     "temperature": (0, math.inf, "a number of at least 0"),
+    "embedding_size": (1, 65536, "a whole number from 1 to 65536"),
+    "target_update_period": (1, math.inf, "a whole number of at least 1"),
+    "priority_exponent": (0, math.inf, "a number of at least 0"),
+    "min_priority": (0, math.inf, "a number of at least 0"),
+    "checkpoint_switch": (0, math.inf, "a whole number of at least 0"),
+    "assessment_episodes": (1, math.inf, "a whole number of at least 1"),
+    "checkpoint_reset_weight": (0, 1, "a number from 0 to 1"),
     "steps": (1, 2**31 - 1, "a whole number from 1 to 2147483647"),
     "warmup_steps": (0, math.inf, "a whole number of at least 0"),
     "batch_size": (1, math.inf, "a whole number of at least 1"),
@@ -167,6 +182,7 @@ def check_train(train: TrainConfig) -> None:
         "warmup_steps",
         f"takes fewer than the run's steps ({train.steps}), not {train.warmup_steps}: nothing would be learned",
     )
+    _refuse(train.capacity < 1, "replay_capacity", f"takes at least num_envs ({train.num_envs})")
     _refuse(
         train.batch_size > train.capacity,
         "batch_size",

@@ -106,28 +106,32 @@ class Critic(nn.Module):
         return Dense(1, name=f"layer{len(self.hidden)}")(x)[..., 0]
 
 
-def _network(module: nn.Module) -> Network:
+def network(module: nn.Module) -> Network:
     return Network(module.init, module.apply)
 
 
-def tanh_actor(action_size: int, hidden: Sequence[int]) -> Network:
-    """obs [B, O] -> action [B, A] in (-1, 1)"""
-    return _network(TanhActor(action_size, hidden))
-
-
-def gaussian_actor(action_size: int, hidden: Sequence[int]) -> Network:
-    """obs [B, O] -> `Gaussian` of [B, A]"""
-    return _network(GaussianActor(action_size, hidden))
-
-
-def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> Network:
-    """N independent critics as one: obs [B, O], action [B, A] -> [N, B]"""
-    ensemble = nn.vmap(
-        Critic,
+def ensemble_of(module: type[nn.Module], ensemble_size: int) -> Callable[..., nn.Module]:
+    """N independent modules as one: parameters and outputs get a leading axis N, inputs are shared."""
+    return nn.vmap(
+        module,
         in_axes=None,
         out_axes=0,
         axis_size=ensemble_size,
         variable_axes={"params": 0},
         split_rngs={"params": True},
     )
-    return _network(ensemble(hidden))
+
+
+def tanh_actor(action_size: int, hidden: Sequence[int]) -> Network:
+    """obs [B, O] -> action [B, A] in (-1, 1)"""
+    return network(TanhActor(action_size, hidden))
+
+
+def gaussian_actor(action_size: int, hidden: Sequence[int]) -> Network:
+    """obs [B, O] -> `Gaussian` of [B, A]"""
+    return network(GaussianActor(action_size, hidden))
+
+
+def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> Network:
+    """N independent critics as one: obs [B, O], action [B, A] -> [N, B]"""
+    return network(ensemble_of(Critic, ensemble_size)(hidden))

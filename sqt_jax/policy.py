@@ -1,21 +1,21 @@
 """A trained policy on disk: parameters as plain arrays, settings as JSON. Loading executes nothing.
 
 policy/config.json     settings and sizes
-policy/member_0.npz    the actor's parameters of member 0, by path ("params/layer0/kernel")
+policy/member_0.npz    what acting needs of member 0, by path ("params/layer0/kernel")
 """
 
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import traverse_util
 
-from sqt_jax.algorithms import ALGORITHMS, make_config
+from sqt_jax.algorithms import ALGORITHMS, agent_of, make_config
 from sqt_jax.config import Config
-from sqt_jax.types import Array, Environment, State
+from sqt_jax.types import Array, Environment, Params, State
 
 
 def save_policy(directory: Path | str, config: Config, env: Environment, agent_state: State) -> None:
@@ -28,7 +28,7 @@ def save_policy(directory: Path | str, config: Config, env: Environment, agent_s
     directory.mkdir(parents=True)
     sizes = {"observation_size": env.observation_size, "action_size": env.action_size}
     (directory / "config.json").write_text(json.dumps(config.flat() | sizes, indent=1) + "\n")
-    arrays = traverse_util.flatten_dict(jax.device_get(agent_state.actor), sep="/")
+    arrays = _by_path(jax.device_get(agent_of(config, env).policy(agent_state)))
     for member in range(next(iter(arrays.values())).shape[0]):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
 
@@ -43,17 +43,24 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
     directory = Path(directory)
     settings = json.loads((directory / "config.json").read_text())
     sizes = settings.pop("observation_size"), settings.pop("action_size")
-    config = make_config(**settings | {"hidden": tuple(settings["hidden"])})
+    config = make_config(**settings)
     agent = ALGORITHMS[config.algo].make_agent(config.agent, *sizes)
+    expected = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
+    shapes = {name: leaf.shape for name, leaf in _by_path(expected).items()}
     with np.load(directory / f"member_{member}.npz", allow_pickle=False) as file:
-        actor = traverse_util.unflatten_dict({name: jnp.asarray(file[name]) for name in file.files}, sep="/")
-    state = agent.init(jax.random.key(0))
-    if jax.tree.map(jnp.shape, actor) != jax.tree.map(jnp.shape, state.actor):
-        raise ValueError(f"{directory}: member {member} does not hold the actor of {config.algo} for sizes {sizes}")
-    state = state._replace(actor=actor)
+        arrays = {name: jnp.asarray(file[name]) for name in file.files}
+    if {name: array.shape for name, array in arrays.items()} != shapes:
+        raise ValueError(f"{directory}: member {member} does not hold a policy of {config.algo} for sizes {sizes}")
+    params = jax.tree.unflatten(jax.tree.structure(expected), [arrays[name] for name in shapes])
 
     @jax.jit
     def policy(obs: Array) -> Array:
-        return agent.act(state, jnp.asarray(obs, jnp.float32), jax.random.key(0), deterministic=True)
+        return agent.policy_action(params, jnp.asarray(obs, jnp.float32))
 
     return policy
+
+
+def _by_path(tree: Params) -> dict[str, Any]:
+    """Leaves by their path, "params/layer0/kernel", in the order of the tree."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -63,8 +63,11 @@ def uniform(capacity: int, batch_size: int, observation_size: int, action_size: 
             size=jnp.minimum(state.size + count, capacity),
         )
 
-    def sample(state: UniformState, key: Array) -> Transition:
+    def sample(state: UniformState, key: Array) -> tuple[Transition, Array]:
         index = jax.random.randint(key, (batch_size,), 0, state.size)
-        return unpack(state.storage[index], observation_size, action_size)
+        return unpack(state.storage[index], observation_size, action_size), index
 
-    return Replay(init, insert, sample)
+    def feedback(state: UniformState, index: Array, td_error: Array, gradient_steps: Array) -> UniformState:
+        return state  # every row stays as likely as any other
+
+    return Replay(init, insert, sample, feedback)

@@ -25,16 +25,17 @@ class Episodes(NamedTuple):
         zeros, zero = jnp.zeros(num_envs), jnp.zeros(())
         return cls(zeros, zeros, zero, zero, zero)
 
-    def add(self, reward: Array, over: Array) -> "Episodes":
-        """reward [E], over [E] bool: the episodes that end with this reward."""
+    def add(self, reward: Array, over: Array) -> tuple["Episodes", Array]:
+        """Takes reward [E] and over [E] bool (the episodes that end with it); gives the returns up to here too, [E]."""
         total, length = self.running_return + reward, self.running_length + 1
-        return Episodes(
+        episodes = Episodes(
             running_return=jnp.where(over, 0.0, total),
             running_length=jnp.where(over, 0.0, length),
             ended_return=self.ended_return + jnp.sum(total, where=over),
             ended_length=self.ended_length + jnp.sum(length, where=over),
             ended=self.ended + jnp.sum(over),
         )
+        return episodes, total
 
     def forget_ended(self) -> "Episodes":
         zero = jnp.zeros(())

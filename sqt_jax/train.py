@@ -94,18 +94,22 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
             return jnp.where(learn, agent.act(state.agent, obs, act_key), uniform)
 
         timestep, transition = rollout.step(env, state.timestep, behaviour)
+        over = timestep.terminated | timestep.truncated
+        episodes, episode_return = state.episodes.add(transition.reward, over)
+        agent_state = agent.observe(state.agent, episode_return, over)
         replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):
-            agent_state, mean = carry
+            agent_state, replay_state, mean = carry
             sample_key, noise_key = jax.random.split(jax.random.fold_in(update_key, i))
-            batch = replay.sample(replay_state, sample_key)
-            agent_state, _, metrics = agent.update(agent_state, batch, noise_key)
-            return agent_state, mean.add(metrics)
+            batch, rows = replay.sample(replay_state, sample_key)
+            agent_state, td_error, metrics = agent.update(agent_state, batch, noise_key)
+            replay_state = replay.feedback(replay_state, rows, td_error, agent_state.gradient_steps)
+            return agent_state, replay_state, mean.add(metrics)
 
         # No updates in the warm-up: a loop of no iterations, so that warm-up and training are one compiled program.
-        agent_state, mean = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, (state.agent, mean))
-        episodes = state.episodes.add(transition.reward, timestep.terminated | timestep.truncated)
+        carry = (agent_state, replay_state, mean)
+        agent_state, replay_state, mean = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, carry)
         env_steps = state.env_steps + num_envs
         return TrainState(agent_state, timestep, episodes, replay_state, state.key, env_steps), mean
 
@@ -114,13 +118,13 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
 
         Both may be traced. The metrics are means over the call; NaN where nothing was measured.
         """
-        sampled = jax.eval_shape(replay.sample, state.replay, state.key)
+        sampled, _ = jax.eval_shape(replay.sample, state.replay, state.key)
         mean = _Mean.start(jax.eval_shape(agent.update, state.agent, sampled, state.key)[2])
         state = state._replace(episodes=state.episodes.forget_ended())
         learn = jnp.asarray(learn)
         state, mean = jax.lax.fori_loop(0, num_steps, lambda _, carry: step(carry[0], carry[1], learn), (state, mean))
         episodes = state.episodes
-        return state, mean.result() | {
+        return state, mean.result() | agent.status(state.agent) | {
             "train_return": episodes.ended_return / episodes.ended,
             "train_length": episodes.ended_length / episodes.ended,
             "train_episodes": episodes.ended,
@@ -138,7 +142,7 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
     return Trainer(init, advance, evaluate_policy)
 
 
-def member_axes(state: TrainState) -> TrainState:
+def member_axes(state: State) -> Any:
     """For each leaf of a state: 0 where members have their own, None where they share it."""
 
     def axis(path, _):
@@ -151,7 +155,8 @@ def member_axes(state: TrainState) -> TrainState:
 def make_sweep(trainer: Trainer) -> Sweep:
     """Compiles a trainer over members; each function compiles once, whatever the number of steps."""
     example = jax.eval_shape(trainer.init, jax.random.key(0))
-    axes = member_axes(example)
+    # The environment is its author's: whatever its fields are called, every member has its own.
+    axes = member_axes(example)._replace(timestep=0)
     return Sweep(
         init=jax.jit(jax.vmap(trainer.init, out_axes=axes)),
         advance=jax.jit(jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=(axes, 0)), donate_argnums=0),
@@ -177,14 +182,14 @@ class History(NamedTuple):
     env_steps: Array  # [evaluations]
     returns: Array  # [evaluations, episodes]
     lengths: Array  # [evaluations, episodes]
-    metrics: Metrics  # [evaluations] each, means since the previous evaluation
+    metrics: Metrics  # [evaluations] each, means since the previous evaluation (where the warm-up ends: since then)
 
 
 def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[TrainState, History]]:
     """One member's whole run as one pure function `train(key, scalars=None)`, for `jax.jit(jax.vmap(train))`."""
     stops = evaluation_steps(config)
     # Rows of two phases (warm-up, training), either of which may be empty.
-    counts = []
+    counts = [[0, 0]]  # the evaluation before the first step
     for start, stop in zip(stops, stops[1:], strict=False):
         parts = {learn: count for count, learn in segments(start, stop, config)}
         counts.append([parts.get(False, 0), parts.get(True, 0)])
@@ -198,18 +203,8 @@ def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[Tra
             last = jnp.where(count[1] > 0, 1, 0)  # the phase that the interval ends in
             return state, (state.env_steps, trainer.evaluate(state), jax.tree.map(lambda m: m[last], metrics))
 
-        state = trainer.init(key, scalars)
-        first = trainer.evaluate(state)
-        state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, state, jnp.array(counts))
-
-        def join(first, rest):
-            return jnp.concatenate([first[None], rest])
-
-        return state, History(
-            env_steps=join(jnp.zeros((), jnp.int32), env_steps),
-            returns=join(first.returns, evaluations.returns),
-            lengths=join(first.lengths, evaluations.lengths),
-            metrics=jax.tree.map(lambda m: join(jnp.full((), jnp.nan), m), metrics),
-        )
+        start = trainer.init(key, scalars)
+        state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, start, jnp.array(counts))
+        return state, History(env_steps, evaluations.returns, evaluations.lengths, metrics)
 
     return train

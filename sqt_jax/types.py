@@ -75,6 +75,10 @@ class Agent(NamedTuple):
     draw_noise: Callable[[Array, Transition], Any]  # (key, batch) -> noise
     update_with_noise: Callable[[State, Transition, Any], tuple[State, Array, Metrics]]
     td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]  # (state, batch, noise) -> [B], terms
+    policy: Callable[[State], Params]  # state -> what deterministic acting needs of it
+    policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
+    observe: Callable[[State, Array, Array], State] = lambda state, episode_return, ended: state  # [E], [E] bool
+    status: Callable[[State], Metrics] = lambda state: {}  # what is worth reporting of a state
 
 
 class Replay(NamedTuple):
@@ -82,7 +86,8 @@ class Replay(NamedTuple):
 
     init: Callable[[], State]
     insert: Callable[[State, Transition], State]  # E new transitions at once
-    sample: Callable[[State, Array], Transition]  # (state, key) -> batch of B transitions
+    sample: Callable[[State, Array], tuple[Transition, Array]]  # (state, key) -> B transitions, their rows [B]
+    feedback: Callable[[State, Array, Array, Array], State]  # (state, rows [B], td_error [B], gradient_steps) -> state
 
 
 class Scalars(NamedTuple):

@@ -85,8 +85,13 @@ def compiled_step(name: str):
 
 
 @cache
+def placed(name: str) -> TimeStep:
+    """The recorded states in our environment."""
+    rows = recorded(name)
+    return jax.jit(jax.vmap(environment(name).set_physics))(rows.qpos, rows.qvel)
+
+
+@cache
 def ours(name: str) -> tuple[TimeStep, TimeStep]:
     """The recorded states in our environment, and one step from them."""
-    rows = recorded(name)
-    first = jax.jit(jax.vmap(environment(name).set_physics))(rows.qpos, rows.qvel)
-    return first, compiled_step(name)(first, rows.action)
+    return placed(name), compiled_step(name)(placed(name), recorded(name).action)

@@ -1,5 +1,7 @@
 """Tiny environments with known Q-values, through the same wrapper as the real tasks."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -46,3 +48,20 @@ def countdown(length: int = 3) -> Environment:
         return state, state[None], jnp.ones(()), state >= length
 
     return make_environment("countdown", 1, 1, 100, start, advance)
+
+
+class Sized(NamedTuple):
+    size: jax.Array
+
+
+def with_a_field_called_size() -> Environment:
+    """A state with a field of the name of one of the trainer's counters."""
+
+    def start(key):
+        size = jax.random.uniform(key, minval=1.0, maxval=2.0)
+        return Sized(size), size[None]
+
+    def advance(state, action):
+        return state, state.size[None], state.size, jnp.zeros((), bool)
+
+    return make_environment("sized", 1, 1, 5, start, advance)

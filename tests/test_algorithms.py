@@ -1,37 +1,92 @@
 """The table of algorithms: its names, its rows, and that the functions of a name are those of its row."""
 
 import jax
+import jax.numpy as jnp
 import pytest
 from probe_envs import constant_reward
 
-from sqt_jax.agents import sac, td3
-from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS, agent_of, make_config, make_trainer
+from sqt_jax import lap, replay
+from sqt_jax.agents import sac, td3, td7
+from sqt_jax.algorithms import (
+    AGENT_SETTINGS,
+    ALGORITHMS,
+    TRAIN_SETTINGS,
+    agent_of,
+    make_config,
+    make_train,
+    make_trainer,
+    replay_of,
+)
+from sqt_jax.config import ConfigError
 
 VARIANTS = {"": ("none", 0.0), "_sqt": ("batch_std", 0.5), "_sqt_tuple": ("transition_std", 0.1)}
+PAPERS_NINE = {"td3": td3, "sac": sac, "td7": td7}  # each with all variants
+EARLIER = {"maxmin": td3, "redq": sac}  # with and without _sqt
+NAMES = {base + suffix: module for base, module in PAPERS_NINE.items() for suffix in VARIANTS} | {
+    base + suffix: module for base, module in EARLIER.items() for suffix in ("", "_sqt")
+}
+TD7 = [name for name, module in NAMES.items() if module is td7]
 
 
-@pytest.mark.parametrize(("base", "module"), [("td3", td3), ("sac", sac)])
-@pytest.mark.parametrize("suffix", VARIANTS)
-def test_every_base_has_its_variants(base, module, suffix):
-    row, agent = ALGORITHMS[base + suffix], make_config(base + suffix, "ant").agent
-    assert row.make_agent is module.make
-    assert (agent.penalty, agent.penalty_coef) == VARIANTS[suffix]
+def base_of(algo):
+    return algo.split("_sqt")[0]
+
+
+def test_the_table_has_these_names():
+    assert set(ALGORITHMS) == set(NAMES)
+
+
+@pytest.mark.parametrize("algo", NAMES)
+def test_each_name_is_its_bases_agent_with_its_variants_penalty(algo):
+    agent = make_config(algo, "ant").agent
+    assert ALGORITHMS[algo].make_agent is NAMES[algo].make
+    assert (agent.penalty, agent.penalty_coef) == VARIANTS[algo.removeprefix(base_of(algo))]
 
 
 @pytest.mark.parametrize("algo", [name for name in ALGORITHMS if "_sqt" in name])
 def test_a_variant_differs_from_its_base_by_the_penalty_alone(algo):
-    ours, plain = make_config(algo, "ant").flat(), make_config(algo.split("_sqt")[0], "ant").flat()
+    ours, plain = make_config(algo, "ant").flat(), make_config(base_of(algo), "ant").flat()
     assert {name for name in ours if ours[name] != plain[name]} == {"algo", "penalty", "penalty_coef"}
+    fields = ("make_agent", "training", "ignores", "prioritised", "single_env")
+    row, base_row = ALGORITHMS[algo], ALGORITHMS[base_of(algo)]
+    assert all(getattr(row, field) == getattr(base_row, field) for field in fields)
+
+
+@pytest.mark.parametrize(
+    ("algo", "base", "differences"),
+    [
+        ("maxmin", "td3", {"ensemble_size": 4}),
+        ("redq", "sac", {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5}),
+    ],
+)
+def test_the_earlier_ensembles_are_settings_of_td3_and_sac(algo, base, differences):
+    ours, theirs = make_config(algo, "ant").flat(), make_config(base, "ant").flat()
+    assert {name: ours[name] for name in ours if ours[name] != theirs[name]} == {"algo": algo} | differences
+    assert ours["subset_size"] == 2
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_rows_name_settings_that_exist(algo):
     assert set(ALGORITHMS[algo].settings) <= AGENT_SETTINGS
+    assert set(ALGORITHMS[algo].training) <= TRAIN_SETTINGS
+    assert ALGORITHMS[algo].ignores <= AGENT_SETTINGS - set(ALGORITHMS[algo].settings)
 
 
 def test_settings_override_the_row():
     agent = make_config("td3_sqt", "ant", penalty_coef=0.25, policy_delay=3, penalty="transition_std").agent
     assert (agent.penalty_coef, agent.policy_delay, agent.penalty) == (0.25, 3, "transition_std")
+    assert make_config("redq", "ant", updates_per_step=20).train.updates_per_step == 20
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_several_environments_are_refused_for_td7_alone(algo):
+    settings = {"num_envs": 4, "warmup_steps": 400, "eval_every": 400, "steps": 4000}
+    if algo in TD7:
+        with pytest.raises(ConfigError, match=f"--num_envs: takes 1 for {algo}, ") as error:
+            make_config(algo, "ant", **settings)
+        assert error.value.setting == "num_envs"
+    else:
+        assert make_config(algo, "ant", **settings).train.num_envs == 4
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -42,4 +97,38 @@ def test_an_environment_of_ones_own_gives_the_sizes(algo):
     assert jax.tree.leaves(agent.critic)[1].shape == (3, env.observation_size + env.action_size, 5)
     state = jax.eval_shape(make_trainer(config, env).init, jax.random.key(0))
     assert jax.tree.structure(state.agent) == jax.tree.structure(agent)
-    assert state.replay.storage.shape == (300, 2 * env.observation_size + env.action_size + 2)
+    storage = (state.replay.rows if algo in TD7 else state.replay).storage
+    assert storage.shape == (300, 2 * env.observation_size + env.action_size + 2)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_row_makes_a_whole_run(algo):
+    """Traced, not compiled: that every part of the row fits the train loop."""
+    env = constant_reward()
+    config = make_config(algo, "ant", hidden=(5, 4), steps=1000, warmup_steps=300, eval_every=500, eval_episodes=2)
+    state, history = jax.eval_shape(jax.vmap(make_train(config, env)), jax.random.split(jax.random.key(0), 3))
+    assert history.returns.shape == (3, 3, 2)
+    assert state.agent.gradient_steps.shape == (3,)
+    needed = {"critic_loss", "actor_loss", "q_mean", "q_std", "penalty", "td_target", "td_error", "train_return"}
+    own = {td3: set(), sac: {"temperature", "entropy"}, td7: {"encoder_loss", "assessments", "checkpoint_refreshes"}}
+    assert needed | own[NAMES[algo]] <= set(history.metrics)
+    assert all(value.shape == (3, 3) for value in history.metrics.values())
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_replay_is_lap_for_td7_alone_with_the_agents_settings(algo):
+    env = constant_reward()
+    if algo not in TD7:
+        state = replay_of(make_config(algo, "ant", replay_capacity=300), env).init()
+        assert isinstance(state, replay.UniformState)
+        return
+    settings = {"priority_exponent": 0.5, "min_priority": 4.0, "target_update_period": 3}
+    buffer = replay_of(make_config(algo, "ant", replay_capacity=300, **settings), env)
+    state = buffer.init()
+    assert isinstance(state, lap.LapState)
+    rows = jnp.arange(2)
+    state = buffer.feedback(state, rows, jnp.array([0.0, 25.0]), jnp.int32(1))
+    assert state.levels[0][0, :2].tolist() == [2, 5]  # max(error, 4) ** 0.5
+    state = buffer.feedback(state, rows, jnp.zeros(2), jnp.int32(2))
+    assert state.max_priority == 5
+    assert buffer.feedback(state, rows, jnp.zeros(2), jnp.int32(3)).max_priority == 2  # refreshed every 3 updates

@@ -15,17 +15,32 @@ def test_defaults_are_the_papers_protocol(algo):
     train, agent = config.train, config.agent
     assert (config.algo, config.env, config.physics) == (algo, "ant", "mjx")
     assert (train.steps, train.warmup_steps, train.eval_every, train.eval_episodes) == (1_000_000, 25_000, 5_000, 10)
-    assert (train.batch_size, train.replay_capacity, train.num_envs, train.updates_per_step) == (256, 1_000_000, 1, 1)
+    assert (train.batch_size, train.replay_capacity, train.num_envs) == (256, 1_000_000, 1)
     assert (agent.lr, agent.gamma, agent.hidden) == (3e-4, 0.99, (256, 256))
     assert (agent.ddof, agent.penalty_inside_gamma, agent.actor_reduce) == (1, True, "mean")
-    assert (agent.tau, agent.ensemble_size, agent.reduce) == (0.005, 2, "min")
+    assert agent.tau == 0.005
+    ensemble = {"maxmin": (4, "min", 1), "redq": (10, "subset_min", 5)}.get(algo.split("_sqt")[0], (2, "min", 1))
+    assert (agent.ensemble_size, agent.reduce, train.updates_per_step) == ensemble
 
 
-def test_defaults_of_td3s_noises_and_sacs_temperature():
-    td3, sac = make_config("td3", "ant").agent, make_config("sac", "ant").agent
-    assert (td3.exploration_noise, td3.target_noise, td3.target_noise_clip) == (0.1, 0.2, 0.5)
-    assert (td3.policy_delay, sac.policy_delay) == (2, 1)
-    assert (sac.temperature, sac.learn_temperature) == (0.2, False)
+@pytest.mark.parametrize(("algo", "policy_delay"), [("td3", 2), ("sac", 1), ("td7", 2), ("maxmin", 2), ("redq", 1)])
+def test_defaults_of_the_noises_the_temperature_and_the_delay(algo, policy_delay):
+    agent = make_config(algo, "ant").agent
+    assert agent.policy_delay == policy_delay
+    assert (agent.exploration_noise, agent.target_noise, agent.target_noise_clip) == (0.1, 0.2, 0.5)
+    assert (agent.temperature, agent.learn_temperature) == (0.2, False)
+
+
+def test_defaults_of_td7_are_its_papers():
+    agent = make_config("td7", "ant").agent
+    assert (agent.embedding_size, agent.target_update_period) == (256, 250)
+    assert (agent.priority_exponent, agent.min_priority) == (0.4, 1.0)
+    assert (agent.checkpoint_switch, agent.assessment_episodes, agent.checkpoint_reset_weight) == (750_000, 20, 0.9)
+
+
+def taker(settings):
+    """An algorithm on which these settings have an effect."""
+    return next(algo for algo in ("sac_sqt", "td7_sqt") if not ALGORITHMS[algo].ignores & settings.keys())
 
 
 REFUSED = [
@@ -64,6 +79,16 @@ REFUSED = [
     ("target_noise_clip", {"target_noise_clip": -0.5}),
     ("temperature", {"temperature": -0.2}),
     ("temperature", {"temperature": 0.0, "learn_temperature": True}),
+    ("embedding_size", {"embedding_size": 0}),
+    ("embedding_size", {"embedding_size": 256.0}),
+    ("target_update_period", {"target_update_period": 0}),
+    ("priority_exponent", {"priority_exponent": -0.4}),
+    ("min_priority", {"min_priority": -1.0}),
+    ("min_priority", {"min_priority": 0.0}),
+    ("checkpoint_switch", {"checkpoint_switch": -1}),
+    ("checkpoint_switch", {"checkpoint_switch": 7.5e5}),
+    ("assessment_episodes", {"assessment_episodes": 0}),
+    ("checkpoint_reset_weight", {"checkpoint_reset_weight": 1.1}),
     ("steps", {"steps": 0}),
     ("steps", {"steps": 2**31}),
     ("physics", {"physics": "bullet"}),
@@ -91,7 +116,7 @@ REFUSED = [
 @pytest.mark.parametrize(("setting", "settings"), REFUSED, ids=str)
 def test_what_cannot_be_is_refused_by_its_name(setting, settings):
     with pytest.raises(ConfigError) as error:
-        make_config("sac_sqt", "ant", **settings)
+        make_config(taker(settings), "ant", **settings)
     assert error.value.setting == setting
     message = str(error.value)
     assert message.startswith(f"--{setting}: takes ") and "\n" not in message
@@ -109,12 +134,13 @@ def test_every_limited_setting_is_among_the_refused():
         {"ddof": 0},
         {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5},
         {"num_envs": 8, "replay_capacity": 1_001},
+        {"checkpoint_switch": 0, "assessment_episodes": 1, "priority_exponent": 0.0, "checkpoint_reset_weight": 1.0},
         {"steps": 256, "warmup_steps": 255, "eval_every": 1000},
     ],
     ids=str,
 )
 def test_the_edges_of_the_limits_are_taken(settings):
-    flat = make_config("sac_sqt", "ant", **settings).flat()
+    flat = make_config(taker(settings), "ant", **settings).flat()
     assert {name: flat[name] for name in settings} == settings
 
 
@@ -134,6 +160,29 @@ def test_a_plain_algorithm_may_have_one_critic():
 
 
 @pytest.mark.parametrize(
+    ("algo", "settings"),
+    [
+        ("td3", {"temperature": 0.1}),
+        ("td3_sqt", {"target_update_period": 100}),
+        ("sac", {"exploration_noise": 0.2}),
+        ("redq_sqt", {"min_priority": 2.0}),
+        ("td7", {"tau": 0.01}),
+        ("td7_sqt", {"temperature": 0.1}),
+    ],
+)
+def test_a_setting_without_effect_is_refused_and_its_default_is_taken(algo, settings):
+    (name,) = settings
+    with pytest.raises(ConfigError, match=f"--{name}: has no effect with {algo}$"):
+        make_config(algo, "ant", **settings)
+    assert make_config(algo, "ant", **{name: getattr(AgentConfig, name)}) == make_config(algo, "ant")
+
+
+def test_a_learned_temperature_is_refused_by_the_flags_name():
+    with pytest.raises(ConfigError, match="--temperature: has no effect with td3"):
+        make_config("td3", "ant", learn_temperature=True)
+
+
+@pytest.mark.parametrize(
     ("settings", "setting", "hint"),
     [
         ({"penalty_coeff": 0.5}, "penalty_coeff", "did you mean penalty_coef?"),
@@ -142,7 +191,7 @@ def test_a_plain_algorithm_may_have_one_critic():
         ({"zzz": 1}, "zzz", "is not a setting"),
         ({"algo": "sac_sqtt"}, "algo", "did you mean sac_sqt?"),
         ({"algo": "ppo"}, "algo", "takes one of td3, td3_sqt, "),
-        ({"env": "humanoidd"}, "env", "did you mean 'humanoid'?"),
+        ({"env": "humanoidd"}, "env", "did you mean humanoid?"),
     ],
     ids=str,
 )
@@ -166,6 +215,8 @@ CONFIGS = [
     make_config("td3", "walker2d"),
     make_config("sac_sqt_tuple", "humanoid", penalty_coef=0.3, hidden=(64,), num_envs=4, ensemble_size=5, ddof=0),
     make_config("sac", "cheetah", learn_temperature=True, reduce="subset_min", steps=50_000),
+    make_config("redq_sqt", "ant", updates_per_step=3),
+    make_config("td7_sqt_tuple", "cheetah", target_update_period=100, checkpoint_switch=5_000),
 ]
 
 

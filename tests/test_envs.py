@@ -58,14 +58,6 @@ def test_same_key_and_actions_give_the_same_episode():
         np.testing.assert_array_equal(a, b)
 
 
-def test_step_leaves_its_input_alone():
-    timestep = play([GO])[-1]
-    before = leaves(timestep)
-    ENV.step(timestep, GO)
-    for a, b in zip(before, leaves(timestep), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_other_keys_give_other_starts():
     starts = {float(play([], key)[0].obs[0]) for key in range(20)}
     assert len(starts) == 20

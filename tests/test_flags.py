@@ -1,11 +1,12 @@
 import dataclasses
+import re
 import subprocess
 import sys
 
 import pytest
 
 from experiments import flags
-from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.algorithms import ALGORITHMS, SALE_AND_LAP
 from sqt_jax.config import AgentConfig, TrainConfig
 
 
@@ -55,7 +56,7 @@ def test_temperature_auto_is_learned():
 
 
 BAD = {
-    "--stepz=5": "--stepz: unknown flag; did you mean --steps?",
+    "--stepz=5": "--stepz: unknown flag; did you mean steps?",
     "--wibble": "--wibble: unknown flag; --help lists the flags",
     "--steps=many": "--steps=many: takes a whole number",
     "--steps=1.5": "--steps=1.5: takes a whole number",
@@ -78,10 +79,10 @@ BAD = {
     "--seeds=4294967296": "--seeds=4294967296: takes whole numbers from 0 to 4294967295",
     "--seeds=0.5": "--seeds=0.5: takes whole numbers like 0,1,2",
     "--preset=fast": "--preset=fast: takes one of paper, quick",
-    "--name=a/b": "--name=a/b: takes up to 200 bytes without slashes: it becomes a folder's name",
-    "--name=..": "--name=..: takes up to 200 bytes without slashes: it becomes a folder's name",
-    "--name=": "--name=: takes up to 200 bytes without slashes: it becomes a folder's name",
-    "--name=a\tb": "--name=a\tb: takes up to 200 bytes without slashes: it becomes a folder's name",
+    "--name=a/b": "--name=a/b: takes up to 200 bytes, no slashes or control characters: it names a folder",
+    "--name=..": "--name=..: takes up to 200 bytes, no slashes or control characters: it names a folder",
+    "--name=": "--name=: takes up to 200 bytes, no slashes or control characters: it names a folder",
+    "--name=a\tb": "--name=a\tb: takes up to 200 bytes, no slashes or control characters: it names a folder",
     "--out=": "--out=: takes a folder",
     "extra": "extra: unexpected argument; settings are given as --flag=value",
 }
@@ -119,11 +120,35 @@ def test_every_setting_is_a_flag_with_help_and_its_default():
 
 
 def test_defaults_that_differ_between_algorithms_are_told():
-    varied = {name for row in ALGORITHMS.values() for name in row.settings} - set(flags.NOT_FLAGS)
-    assert varied == set(flags.DEFAULT_TEXT)
-    assert ALGORITHMS["sac_sqt"].settings["penalty_coef"] == 0.5
-    assert ALGORITHMS["td3_sqt_tuple"].settings["penalty_coef"] == 0.1
-    assert ALGORITHMS["td3"].settings["policy_delay"] == 2
+    default = {
+        field.name: field.default for config in (AgentConfig, TrainConfig) for field in dataclasses.fields(config)
+    }
+    rows = {algo: {**row.settings, **row.training} for algo, row in ALGORITHMS.items()}
+    varied = {name for row in rows.values() for name, value in row.items() if value != default[name]}
+    assert varied - set(flags.NOT_FLAGS) == set(flags.DEFAULT_TEXT)
+    for name, text in flags.DEFAULT_TEXT.items():
+        values = {
+            row.get(name, default[name]) for algo, row in rows.items() if name != "penalty_coef" or "_sqt" in algo
+        }
+        assert all(str(value) in re.split(r"[ ;,]+", text) for value in values), name
+
+
+def test_every_algorithm_is_named_in_the_help():
+    text = next(flag.help for flag in flags.FLAGS["What to run"] if flag.name == "algo")
+    for algo in ALGORITHMS:
+        assert re.search(rf"\b{algo.split('_sqt')[0]}\b", text)
+
+
+def test_td7s_settings_have_a_group_of_their_own():
+    assert [flag.name for flag in flags.FLAGS["TD7"]] == list(flags.TD7_SETTINGS)
+    assert set(flags.TD7_SETTINGS) == SALE_AND_LAP
+    names = [flag.name for group in flags.FLAGS.values() for flag in group]
+    assert len(names) == len(set(names))
+    assert parse("--target_update_period=100", "--priority_exponent=0.5", "--checkpoint_switch=1e5").settings == {
+        "target_update_period": 100,
+        "priority_exponent": 0.5,
+        "checkpoint_switch": 100_000,
+    }
 
 
 def test_reading_the_command_line_imports_nothing_heavy():

@@ -24,6 +24,21 @@ def test_critic_loss_of_one_more_critic_leaves_the_others_gradients():
     np.testing.assert_allclose(jax.grad(losses.critic_loss)(Q[:1], jnp.array([0.0, 2.0])), grad[:1])
 
 
+def test_lap_huber_is_quadratic_below_the_minimum_priority_and_linear_above(maybe_jit):
+    target = jnp.array([0.5, 2.0])  # errors 0.5 and 0; 2.5 and 3
+    loss = maybe_jit(lambda q, target: losses.lap_huber(q, target, 1.0))(Q, target)
+    assert loss.shape == ()
+    np.testing.assert_allclose(loss, (0.125 + 0) / 2 + (2.5 + 3) / 2)  # summed over critics, averaged over the batch
+    np.testing.assert_allclose(losses.lap_huber(Q, target, 2.75), (0.125 + 0) / 2 + (3.125 + 2.75 * 3) / 2)
+
+
+def test_lap_hubers_slope_is_bounded():
+    grad = jax.grad(lambda q: losses.lap_huber(q, jnp.array([0.5, 2.0]), 1.0))(Q)
+    np.testing.assert_allclose(grad, [[0.25, 0], [0.5, 0.5]])  # the error up to 1, per row of the batch
+    below = jax.grad(lambda q: losses.lap_huber(q, jnp.array([10.0, -10.0]), 1.0))(Q)
+    np.testing.assert_allclose(below, [[-0.5, 0.5], [-0.5, 0.5]])
+
+
 @pytest.mark.parametrize(("reduce", "expected"), [("mean", [2, 3.5]), ("min", [1, 2]), ("first", [3, 2])])
 def test_actor_value(maybe_jit, reduce, expected):
     q = jnp.array([[3.0, 2.0], [1.0, 5.0]])

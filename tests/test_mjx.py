@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from gym_reference import ours, recorded
+from gym_reference import ours, placed, recorded
 
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
@@ -163,7 +163,7 @@ def equations(jaxpr, primitive):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_first_state_is_at_rest_of_forces(name):
-    timestep = ours(name)[0]
+    timestep = placed(name)
     forces = {k: v for k, v in timestep.state.task.quantities.items() if k in ("qfrc_actuator", "cfrc_ext")}
     assert all(not np.any(v) for v in forces.values())
     assert not np.any(timestep.state.task.displacement)

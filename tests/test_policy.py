@@ -28,7 +28,7 @@ def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
     for member in range(2):
         own = jax.tree.map(lambda leaf, member=member: leaf[member], state)
         expected = agent.act(own, obs, jax.random.key(0), deterministic=True)
-        np.testing.assert_allclose(policy.load_policy(tmp_path / "policy", member)(obs), expected, rtol=1e-6)
+        np.testing.assert_allclose(policy.load_policy(tmp_path / "policy", member)(obs), expected, rtol=1e-5)
 
 
 def test_an_existing_policy_is_not_overwritten(tmp_path):
@@ -41,7 +41,7 @@ def test_parameters_of_other_sizes_are_refused(tmp_path):
     saved("td3", tmp_path / "policy")
     path = tmp_path / "policy" / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"action_size": 3}))
-    with pytest.raises(ValueError, match="does not hold the actor"):
+    with pytest.raises(ValueError, match="does not hold a policy"):
         policy.load_policy(tmp_path / "policy")
 
 

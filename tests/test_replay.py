@@ -66,10 +66,12 @@ def test_the_ring_is_a_deque_of_the_newest_rows(width, inserts, seed):
         return
     oldest_first = np.roll(state.storage, -int(state.pointer), axis=0)[CAPACITY - len(model) :]
     assert_same(replay.unpack(oldest_first, O, A), transitions(list(model)))
-    batch = sample(state, jax.random.key(seed))
+    batch, rows = sample(state, jax.random.key(seed))
     ids = np.asarray(batch.reward) / 10
     assert set(ids) <= set(model)  # so never an empty row, whose id would be 0
     assert_same(batch, transitions(ids))
+    assert rows.shape == (BATCH,)
+    assert_same(batch, replay.unpack(np.asarray(state.storage)[rows], O, A))
 
 
 @pytest.mark.parametrize("filled", [1, 5, 8], ids=["one row", "partly", "full"])
@@ -78,7 +80,7 @@ def test_sampling_is_uniform_over_the_filled_rows(filled):
     state = init()
     for i in range(1, filled + 1):
         state = insert(state, transitions([i]))
-    ids, counts = np.unique(sample(state, jax.random.key(0)).reward, return_counts=True)
+    ids, counts = np.unique(sample(state, jax.random.key(0))[0].reward, return_counts=True)
     np.testing.assert_array_equal(ids, 10.0 * np.arange(1, filled + 1))
     assert filled == 1 or stats.chisquare(counts).pvalue > 1e-3
 
@@ -86,9 +88,16 @@ def test_sampling_is_uniform_over_the_filled_rows(filled):
 def test_another_key_samples_another_batch():
     init, insert, sample = compiled()
     state = insert(init(), transitions(range(1, CAPACITY + 1)))
-    first, again, other = (sample(state, jax.random.key(seed)).reward for seed in (0, 0, 1))
+    first, again, other = (sample(state, jax.random.key(seed))[1] for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert np.any(first != other)
+
+
+def test_feedback_changes_nothing():
+    buffer = replay.uniform(CAPACITY, BATCH, O, A)
+    state = buffer.insert(buffer.init(), transitions(range(1, CAPACITY + 1)))
+    after = buffer.feedback(state, jnp.arange(BATCH), jnp.full(BATCH, 1e6), jnp.int32(250))
+    assert after is state
 
 
 @pytest.mark.parametrize("width", [4, 5, 7, 12])
@@ -122,7 +131,7 @@ def loop_of_members(buffer, members=5):
             state, total = carry
             state = insert(state, transition)
             keys = jax.random.split(jax.random.fold_in(jax.random.key(0), i), members)
-            batch = jax.vmap(buffer.sample, in_axes=(MEMBER_AXES, 0))(state, keys)
+            batch, _ = jax.vmap(buffer.sample, in_axes=(MEMBER_AXES, 0))(state, keys)
             return state, total + jnp.sum(batch.reward)
 
         return jax.lax.fori_loop(0, 100, body, (state, jnp.zeros(())))

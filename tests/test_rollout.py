@@ -67,8 +67,9 @@ def test_episodes_are_counted_as_plain_python_does(maybe_jit):
     add = maybe_jit(lambda episodes, reward, over: episodes.add(reward, over))
     episodes, returns, lengths, ended = rollout.Episodes.start(3), np.zeros(3), np.zeros(3), []
     for reward, over in zip(rewards, overs, strict=True):
-        episodes = add(episodes, reward, over)
+        episodes, so_far = add(episodes, reward, over)
         returns, lengths = returns + reward, lengths + 1
+        np.testing.assert_allclose(so_far, returns, rtol=1e-4, atol=1e-5)  # with the reward of an episode's last step
         ended += [(returns[i], lengths[i]) for i in range(3) if over[i]]
         returns, lengths = np.where(over, 0, returns), np.where(over, 0, lengths)
     assert len(ended) > 10
@@ -80,7 +81,8 @@ def test_episodes_are_counted_as_plain_python_does(maybe_jit):
 
 
 def test_forgetting_ended_episodes_keeps_the_running_ones():
-    episodes = rollout.Episodes.start(2).add(jnp.array([1.0, 2.0]), jnp.array([True, False])).forget_ended()
+    episodes, _ = rollout.Episodes.start(2).add(jnp.array([1.0, 2.0]), jnp.array([True, False]))
+    episodes = episodes.forget_ended()
     assert episodes.ended == episodes.ended_return == episodes.ended_length == 0
     np.testing.assert_array_equal(episodes.running_return, [0, 2])
     np.testing.assert_array_equal(episodes.running_length, [0, 1])

@@ -2,14 +2,17 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
-from sqt_jax import losses, q_targets
+from sqt_jax import q_targets
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_step
 from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
+
+AgentState = TypeVar("AgentState", bound=Any)
 
 
 def draw_subset(key: Array, config: AgentConfig) -> Array:
@@ -44,6 +47,7 @@ def td_target(
     next_q: Array,
     subset: Array,
     entropy_term: Array | float = 0.0,
+    value_bounds: tuple[Array, Array] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """The variant's target from the target critics' values `next_q [N, B]` at (s', a').
 
@@ -59,40 +63,47 @@ def td_target(
         reduce=_reduction(config, subset),
         penalty=penalty,
         entropy_term=entropy_term,
+        value_bounds=value_bounds,
         penalty_inside_gamma=config.penalty_inside_gamma,
     )
     return target, {"penalty": penalty(next_q)}
 
 
 def update(
-    apply: Callable[..., Array],
+    apply: Callable[[Params], Array],
+    loss: Callable[[Array], Array],
     config: AgentConfig,
-    params: Params,
-    opt_state,
-    batch: Transition,
+    state: AgentState,
     target: Array,
-    lr: Array | float,
-) -> tuple[Params, object, Array, Metrics]:
-    """One Adam step of all critics towards `target [B]`.
+    terms: dict[str, Array],
+) -> tuple[AgentState, Array, Metrics]:
+    """One Adam step of all critics towards the target.
+
+    Args:
+      apply: parameters -> q [N, B], the critics at the batch's (s, a).
+      loss: q [N, B] -> [].
+      state: an agent's state, with fields `critic`, `critic_opt` and `scalars`.
+      target, terms: as `td_target` gives them.
 
     Returns:
-      parameters, optimizer state, td_error [B] (the largest |Q_i - target| over the critics), metrics. `q_std` is
+      state, td_error [B] (the largest |Q_i - target| over the critics), metrics. `q_std` is
       eq. 18's std[B]: the mean over the batch of the std over the online critics at (s, a).
     """
 
     def loss_fn(params):
-        q = apply(params, batch.obs, batch.action)
-        return losses.critic_loss(q, target), q
+        q = apply(params)
+        return loss(q), q
 
-    (loss, q), grads = jax.value_and_grad(loss_fn, has_aux=True)(params)
-    params, opt_state = adam_step(params, opt_state, grads, lr)
+    (loss_value, q), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.critic)
+    critic, critic_opt = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr)
     td_error = jnp.max(jnp.abs(q - target), axis=0)
     disagrees = config.ensemble_size > 1
     metrics = {
-        "critic_loss": loss,
+        "critic_loss": loss_value,
         "q_mean": jnp.mean(q),
         "q_std": jnp.mean(q_targets.std_over_critics(q, config.ddof)) if disagrees else jnp.full((), jnp.nan),
         "td_error": jnp.mean(td_error),
         "td_target": jnp.mean(target),
+        "penalty": jnp.mean(terms["penalty"]),
     }
-    return params, opt_state, td_error, metrics
+    return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics

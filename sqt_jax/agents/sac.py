@@ -55,9 +55,17 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             gradient_steps=jnp.zeros((), jnp.int32),
         )
 
+    def policy(state: SACState) -> Params:
+        return state.actor
+
+    def policy_action(actor: Params, obs: Array) -> Array:
+        return actor_net.apply(actor, obs).mode()
+
     def act(state: SACState, obs: Array, key: Array, deterministic: bool = False) -> Array:
-        policy = actor_net.apply(state.actor, obs)
-        return policy.mode() if deterministic else policy.sample(jax.random.normal(key, policy.mean.shape))[0]
+        if deterministic:
+            return policy_action(policy(state), obs)
+        gaussian = actor_net.apply(state.actor, obs)
+        return gaussian.sample(jax.random.normal(key, gaussian.mean.shape))[0]
 
     def draw_noise(key: Array, batch: Transition) -> SACNoise:
         next_key, own_key, subset_key = jax.random.split(key, 3)
@@ -80,13 +88,13 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
 
     def update_critic(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
         target, terms = td_target(state, batch, noise)
-        critic, critic_opt, td_error, metrics = critics.update(
-            critic_net.apply, config, state.critic, state.critic_opt, batch, target, state.scalars.lr
-        )
-        return (
-            state._replace(critic=critic, critic_opt=critic_opt),
-            td_error,
-            metrics | {"penalty": jnp.mean(terms["penalty"])},
+        return critics.update(
+            lambda params: critic_net.apply(params, batch.obs, batch.action),
+            lambda q: losses.critic_loss(q, target),
+            config,
+            state,
+            target,
+            terms,
         )
 
     def update_actor(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Metrics]:
@@ -122,4 +130,4 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
     def update(state: SACState, batch: Transition, key: Array) -> tuple[SACState, Array, Metrics]:
         return update_with_noise(state, batch, draw_noise(key, batch))
 
-    return Agent(init, act, update, draw_noise, update_with_noise, td_target)
+    return Agent(init, act, update, draw_noise, update_with_noise, td_target, policy, policy_action)

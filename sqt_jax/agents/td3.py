@@ -1,5 +1,6 @@
 """TD3 (https://arxiv.org/abs/1802.09477) with N critics and the variant's target."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -29,9 +30,25 @@ class TD3Noise(NamedTuple):
     subset: Array  # [M]: critics of the target
 
 
+def make_draw_noise(config: AgentConfig) -> Callable[[Array, Transition], TD3Noise]:
+    def draw_noise(key: Array, batch: Transition) -> TD3Noise:
+        noise_key, subset_key = jax.random.split(key)
+        noise = config.target_noise * jax.random.normal(noise_key, batch.action.shape)
+        return TD3Noise(noise, critics.draw_subset(subset_key, config))
+
+    return draw_noise
+
+
+def smooth(action: Array, noise: Array, config: AgentConfig) -> Array:
+    """Target policy smoothing: the action [B, A] with clipped noise [B, A], in [-1, 1]."""
+    clipped = jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip)
+    return jnp.clip(action + clipped, -1.0, 1.0)
+
+
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
     actor_net = networks.tanh_actor(action_size, config.hidden)
     critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
+    draw_noise = make_draw_noise(config)
 
     def init(key: Array, scalars: Scalars | None = None) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
@@ -49,36 +66,33 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             gradient_steps=jnp.zeros((), jnp.int32),
         )
 
+    def policy(state: TD3State) -> Params:
+        return state.actor
+
+    def policy_action(actor: Params, obs: Array) -> Array:
+        return actor_net.apply(actor, obs)
+
     def act(state: TD3State, obs: Array, key: Array, deterministic: bool = False) -> Array:
-        action = actor_net.apply(state.actor, obs)
+        action = policy_action(policy(state), obs)
         if deterministic:
             return action
         noise = config.exploration_noise * jax.random.normal(key, action.shape)
         return jnp.clip(action + noise, -1.0, 1.0)
 
-    def draw_noise(key: Array, batch: Transition) -> TD3Noise:
-        noise_key, subset_key = jax.random.split(key)
-        noise = config.target_noise * jax.random.normal(noise_key, batch.action.shape)
-        return TD3Noise(noise, critics.draw_subset(subset_key, config))
-
-    def next_action(state: TD3State, batch: Transition, noise: TD3Noise) -> Array:
-        """The smoothed action of the target policy at s'."""
-        clipped = jnp.clip(noise.target_noise, -config.target_noise_clip, config.target_noise_clip)
-        return jnp.clip(actor_net.apply(state.target_actor, batch.next_obs) + clipped, -1.0, 1.0)
-
     def td_target(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[Array, dict[str, Array]]:
-        next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action(state, batch, noise))
+        next_action = smooth(actor_net.apply(state.target_actor, batch.next_obs), noise.target_noise, config)
+        next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         return critics.td_target(config, state.scalars, batch, next_q, noise.subset)
 
     def update_critic(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array, Metrics]:
         target, terms = td_target(state, batch, noise)
-        critic, critic_opt, td_error, metrics = critics.update(
-            critic_net.apply, config, state.critic, state.critic_opt, batch, target, state.scalars.lr
-        )
-        return (
-            state._replace(critic=critic, critic_opt=critic_opt),
-            td_error,
-            metrics | {"penalty": jnp.mean(terms["penalty"])},
+        return critics.update(
+            lambda params: critic_net.apply(params, batch.obs, batch.action),
+            lambda q: losses.critic_loss(q, target),
+            config,
+            state,
+            target,
+            terms,
         )
 
     def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
@@ -115,4 +129,4 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
     def update(state: TD3State, batch: Transition, key: Array) -> tuple[TD3State, Array, Metrics]:
         return update_with_noise(state, batch, draw_noise(key, batch))
 
-    return Agent(init, act, update, draw_noise, update_with_noise, td_target)
+    return Agent(init, act, update, draw_noise, update_with_noise, td_target, policy, policy_action)

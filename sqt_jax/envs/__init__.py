@@ -3,7 +3,8 @@
 from typing import Any
 
 from sqt_jax.envs.gym_tasks import ALIASES, TASKS, make_task
-from sqt_jax.envs.physics import PHYSICS, unknown
+from sqt_jax.envs.physics import PHYSICS
+from sqt_jax.names import unknown
 from sqt_jax.types import Environment
 
 __all__ = ["ALIASES", "PHYSICS", "TASKS", "make", "resolve"]
@@ -17,7 +18,7 @@ def resolve(name: str) -> str:
     """
     name = ALIASES.get(name, name)
     if name not in TASKS:
-        raise ValueError(unknown("environment", name, [*TASKS, *ALIASES]))
+        raise ValueError(unknown(name, [*TASKS, *ALIASES]))
     return name
 
 

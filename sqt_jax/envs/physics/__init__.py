@@ -3,11 +3,11 @@
 A task is written once over `Physics`; which simulator computes it is a name in `PHYSICS`.
 """
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from sqt_jax.names import unknown
 from sqt_jax.types import Array, State
 
 
@@ -59,13 +59,5 @@ def make_physics(name: str, setup: Setup, **options: Any) -> Physics:
       TypeError: the simulator has no such option.
     """
     if name not in PHYSICS:
-        raise ValueError(unknown("physics", name, PHYSICS))
+        raise ValueError("physics " + unknown(name, PHYSICS))
     return import_module(PHYSICS[name]).make(setup, **options)
-
-
-def unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    """The message for a name that is not in a table: all the names, and the nearest one."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"unknown {kind} {name!r}: known are {', '.join(known)}{hint}"

@@ -1,0 +1,107 @@
+"""Prioritised replay for TD7: LAP (https://arxiv.org/abs/2007.06049).
+
+A row is drawn with probability proportional to its priority. The priorities lie in blocks of 128, with the sums of
+blocks and the sums of blocks of blocks beside them: a draw reads one block of each level, a new priority rewrites one
+sum of each level, so that neither depends on the capacity. Sums are computed anew from their block, never adjusted:
+rounding errors cannot accumulate.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sqt_jax import replay
+from sqt_jax.types import Array, Replay, Transition
+
+BLOCK = 128
+
+
+class LapState(NamedTuple):
+    rows: replay.UniformState
+    levels: tuple[Array, ...]  # [blocks, BLOCK] each: priorities, sums of their blocks, ...; the last has one block
+    max_priority: Array  # []: what new rows get
+
+
+def _shapes(capacity: int) -> list[tuple[int, int]]:
+    shapes = [(math.ceil(capacity / BLOCK), BLOCK)]
+    while shapes[-1][0] > 1:
+        shapes.append((math.ceil(shapes[-1][0] / BLOCK), BLOCK))
+    return shapes
+
+
+def priority(td_error: Array, exponent: float, min_priority: float) -> Array:
+    """LAP's priority of rows whose largest |TD error| over the critics is `td_error` [B]: [B]"""
+    return jnp.maximum(td_error, min_priority) ** exponent
+
+
+def set_priorities(levels: tuple[Array, ...], index: Array, value: Array) -> tuple[Array, ...]:
+    """The priorities `value [B]` for the rows `index [B]`, and the sums above them."""
+    changed = []
+    for level in levels:
+        block, place = index // BLOCK, index % BLOCK
+        level = level.at[block, place].set(value)
+        changed.append(level)
+        index, value = block, jnp.sum(level[block], axis=-1)
+    return tuple(changed)
+
+
+def draw(key: Array, weights: Array) -> Array:
+    """For each row of `weights [B, K]` an index with probability proportional to its weight: [B].
+
+    Never one of weight 0, whatever the rounding: the threshold is below the last step of the cumulative sum.
+    """
+    cumulative = jnp.cumsum(weights, axis=-1)
+    total = cumulative[:, -1:]
+    threshold = total * jax.random.uniform(key, (weights.shape[0], 1))
+    last = jnp.sum(cumulative < total, axis=-1)
+    return jnp.minimum(jnp.sum(cumulative <= threshold, axis=-1), last)
+
+
+def draw_rows(key: Array, levels: tuple[Array, ...], batch_size: int) -> Array:
+    """Indices [B] of rows, each with probability proportional to its priority."""
+    index = jnp.zeros(batch_size, jnp.int32)  # the one block of the last level
+    for level_key, level in zip(jax.random.split(key, len(levels)), reversed(levels), strict=True):
+        index = index * BLOCK + draw(level_key, level[index])
+    return index
+
+
+def lap(
+    capacity: int,
+    batch_size: int,
+    observation_size: int,
+    action_size: int,
+    priority_exponent: float = 0.4,
+    min_priority: float = 1.0,
+    refresh_every: int = 250,
+) -> Replay:
+    """A buffer that samples in proportion to max(|td_error|, min_priority)^priority_exponent.
+
+    New rows get the largest priority seen; every `refresh_every` updates that becomes the largest in the buffer.
+    """
+    store = replay.uniform(capacity, batch_size, observation_size, action_size)
+
+    def init() -> LapState:
+        levels = tuple(jnp.zeros(shape) for shape in _shapes(capacity))
+        return LapState(store.init(), levels, jnp.ones(()))
+
+    def insert(state: LapState, transition: Transition) -> LapState:
+        index = state.rows.pointer + jnp.arange(transition.reward.shape[0])
+        levels = set_priorities(state.levels, index, jnp.broadcast_to(state.max_priority, index.shape))
+        return LapState(store.insert(state.rows, transition), levels, state.max_priority)
+
+    def sample(state: LapState, key: Array) -> tuple[Transition, Array]:
+        index = draw_rows(key, state.levels, batch_size)
+        return replay.unpack(state.rows.storage[index], observation_size, action_size), index
+
+    def feedback(state: LapState, index: Array, td_error: Array, gradient_steps: Array) -> LapState:
+        new = priority(td_error, priority_exponent, min_priority)
+        levels = set_priorities(state.levels, index, new)
+        highest = jnp.maximum(state.max_priority, jnp.max(new))
+        # A scalar that members share: a real branch under vmap, taken rarely, since it reads every priority.
+        refresh = gradient_steps % refresh_every == 0
+        highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
+        return LapState(state.rows, levels, highest)
+
+    return Replay(init, insert, sample, feedback)

@@ -1,0 +1,101 @@
+"""TD7's networks: actor and critics conditioned on state-action learned embeddings, SALE
+(https://arxiv.org/abs/2306.02451, section 4).
+
+The encoder gives zs(obs) and zsa(zs, action), trained so that zsa predicts the zs of the next observation.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+
+from sqt_jax.networks import Dense, Network, ensemble_of, network
+from sqt_jax.types import Array, Params
+
+
+def avg_l1_norm(x: Array) -> Array:
+    """x / mean|x| along the last axis, which stays finite at 0."""
+    return x / jnp.maximum(jnp.mean(jnp.abs(x), axis=-1, keepdims=True), 1e-8)
+
+
+class Encoder(nn.Module):
+    """The two embeddings, [B, Z] each. Layers `state0..`, `state_action0..`; ELU between them."""
+
+    embedding_size: int
+    hidden: Sequence[int]
+
+    def setup(self):
+        widths = (*self.hidden, self.embedding_size)
+        self.state_layers = [Dense(width, name=f"state{i}") for i, width in enumerate(widths)]
+        self.state_action_layers = [Dense(width, name=f"state_action{i}") for i, width in enumerate(widths)]
+
+    def zs(self, obs: Array) -> Array:
+        x = obs
+        for layer in self.state_layers[:-1]:
+            x = nn.elu(layer(x))
+        return avg_l1_norm(self.state_layers[-1](x))
+
+    def zsa(self, zs: Array, action: Array) -> Array:
+        x = jnp.concatenate([zs, action], axis=-1)
+        for layer in self.state_action_layers[:-1]:
+            x = nn.elu(layer(x))
+        return self.state_action_layers[-1](x)
+
+    def __call__(self, obs: Array, action: Array) -> tuple[Array, Array]:
+        zs = self.zs(obs)
+        return zs, self.zsa(zs, action)
+
+
+class SaleActor(nn.Module):
+    """obs [B, O], zs [B, Z] -> action [B, A] in (-1, 1); ReLU."""
+
+    action_size: int
+    hidden: Sequence[int]
+
+    @nn.compact
+    def __call__(self, obs: Array, zs: Array) -> Array:
+        x = avg_l1_norm(Dense(self.hidden[0], name="layer0")(obs))
+        x = jnp.concatenate([x, zs], axis=-1)
+        for i, width in enumerate(self.hidden, start=1):
+            x = nn.relu(Dense(width, name=f"layer{i}")(x))
+        return jnp.tanh(Dense(self.action_size, name=f"layer{len(self.hidden) + 1}")(x))
+
+
+class SaleCritic(nn.Module):
+    """One Q function: obs [B, O], action [B, A], zsa and zs [B, Z] -> [B]; ELU."""
+
+    hidden: Sequence[int]
+
+    @nn.compact
+    def __call__(self, obs: Array, action: Array, zsa: Array, zs: Array) -> Array:
+        x = avg_l1_norm(Dense(self.hidden[0], name="layer0")(jnp.concatenate([obs, action], axis=-1)))
+        x = jnp.concatenate([x, zsa, zs], axis=-1)
+        for i, width in enumerate(self.hidden, start=1):
+            x = nn.elu(Dense(width, name=f"layer{i}")(x))
+        return Dense(1, name=f"layer{len(self.hidden) + 1}")(x)[..., 0]
+
+
+class EncoderNetwork(NamedTuple):
+    """Two functions of the same parameters."""
+
+    init: Callable[..., Params]  # (key, obs [B, O], action [B, A])
+    zs: Callable[..., Any]  # (parameters, obs [B, O]) -> [B, Z]
+    zsa: Callable[..., Any]  # (parameters, zs [B, Z], action [B, A]) -> [B, Z]
+
+
+def encoder(embedding_size: int, hidden: Sequence[int]) -> EncoderNetwork:
+    module = Encoder(embedding_size, hidden)
+    return EncoderNetwork(
+        module.init, functools.partial(module.apply, method="zs"), functools.partial(module.apply, method="zsa")
+    )
+
+
+def sale_actor(action_size: int, hidden: Sequence[int]) -> Network:
+    return network(SaleActor(action_size, hidden))
+
+
+def sale_critics(ensemble_size: int, hidden: Sequence[int]) -> Network:
+    """N independent critics as one: -> [N, B]"""
+    return network(ensemble_of(SaleCritic, ensemble_size)(hidden))

@@ -1,0 +1,397 @@
+"""LAP's sums against NumPy, its sampling against exact probabilities, and that its cost does not grow with capacity."""
+
+import re
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from sqt_jax import lap, replay
+from sqt_jax.types import Transition
+
+pytestmark = pytest.mark.usefixtures("strict_dtypes")
+
+O, A = 2, 1  # noqa: E741
+EXPONENT, MIN_PRIORITY, REFRESH = 0.4, 1.0, 4
+CAPACITY, BATCH = 1000, 16  # 1000 rows: 7 full blocks and one of 104 rows
+
+
+def transitions(ids) -> Transition:
+    """Transitions whose reward is the id (from 1), and so told from an empty row, which is all zeros."""
+    ids = np.asarray(ids, np.float32)
+    obs, action = np.repeat(ids[..., None], O, -1), np.repeat(-ids[..., None], A, -1)
+    return Transition(obs, action, ids, obs + 0.5, np.ones_like(ids))
+
+
+@cache
+def compiled(capacity=CAPACITY, batch=BATCH):
+    buffer = lap.lap(capacity, batch, O, A, EXPONENT, MIN_PRIORITY, REFRESH)
+    return buffer.init, jax.jit(buffer.insert), jax.jit(buffer.sample), jax.jit(buffer.feedback)
+
+
+@cache
+def drawer(batch):
+    return jax.jit(lambda key, levels: lap.draw_rows(key, levels, batch))
+
+
+def build(priorities) -> tuple:
+    """The levels over given priorities, by NumPy."""
+    below, levels = np.asarray(priorities, np.float32), []
+    while True:
+        blocks = -(-len(below) // lap.BLOCK)
+        level = np.zeros((blocks, lap.BLOCK), np.float32)
+        level.ravel()[: len(below)] = below
+        levels.append(jnp.asarray(level))
+        if blocks == 1:
+            return tuple(levels)
+        below = level.sum(axis=1)
+
+
+def assert_levels_agree(levels, priorities):
+    """Every level is the sums of the blocks below it, the lowest one the priorities."""
+    for ours, expected in zip(levels, build(priorities), strict=True):
+        assert ours.shape == expected.shape
+        np.testing.assert_allclose(ours, expected, rtol=1e-5)
+
+
+def filled(rows=CAPACITY):
+    """A buffer with `rows` rows, whose ids are 1, 2, ..."""
+    init, insert, *_ = compiled()
+    return insert(init(), transitions(np.arange(1, 1 + rows)))
+
+
+# Sums
+
+
+@pytest.mark.parametrize(
+    ("capacity", "blocks"),
+    [(1, [1]), (128, [1]), (129, [2, 1]), (128**2, [128, 1]), (128**2 + 1, [129, 2, 1]), (10**6, [7813, 62, 1])],
+)
+def test_levels_shrink_by_the_block_size_down_to_one_block(capacity, blocks):
+    state = jax.eval_shape(lap.lap(capacity, 1, O, A).init)
+    assert [level.shape for level in state.levels] == [(count, lap.BLOCK) for count in blocks]
+    assert state.rows.storage.shape == (capacity, replay.row_width(O, A))
+
+
+@given(data=st.data())
+def test_all_sums_stay_those_of_a_plain_model(data):
+    """Inserts and feedback at random; after each, every level is what NumPy sums up and nothing else has changed."""
+    init, insert, _, feedback = compiled()
+    generator = np.random.default_rng(data.draw(st.integers(0, 10**6)))
+    state = init()
+    priorities, highest, pointer, size = np.zeros(CAPACITY, np.float32), 1.0, 0, 0
+    actions = data.draw(st.lists(st.sampled_from([1, 50, 250, "feedback"]), min_size=1, max_size=12))
+    for step, action in enumerate(actions):
+        if action != "feedback":
+            if pointer % action:  # inserts of another width would straddle the end
+                continue
+            rows = np.arange(pointer, pointer + action)
+            state = insert(state, transitions(rows + 1.0))
+            priorities[rows] = highest
+            pointer, size = (pointer + action) % CAPACITY, min(size + action, CAPACITY)
+        elif size:
+            rows = generator.choice(size, size=min(BATCH, size), replace=False)
+            rows = np.resize(rows, BATCH)  # few rows: duplicates, with equal errors
+            error = np.resize(generator.lognormal(1, 2, size=min(BATCH, size)).astype(np.float32), BATCH)
+            state = feedback(state, rows.astype(np.int32), error, jnp.int32(4 * step + 1))  # no refresh
+            priorities[rows] = np.maximum(error, 1) ** np.float32(0.4)
+            highest = max(highest, priorities[rows].max())
+        assert_levels_agree(state.levels, priorities)
+        np.testing.assert_allclose(state.max_priority, highest, rtol=1e-6)
+        assert (state.rows.pointer, state.rows.size) == (pointer, size)
+
+
+def test_sums_do_not_drift():
+    """Between 1e6 and 1e-6, so that sums which were adjusted would keep the rounding errors of the large ones."""
+    levels = build(np.full(300, 1e-6))
+    change = jax.jit(lap.set_priorities)
+    rows = jnp.arange(300)
+    for _ in range(5):
+        levels = change(change(levels, rows, jnp.full(300, 1e6)), rows, jnp.full(300, 1e-6))
+    assert_levels_agree(levels, np.full(300, 1e-6))
+
+
+def test_duplicate_rows_leave_one_of_their_priorities_and_matching_sums():
+    levels = jax.jit(lap.set_priorities)(
+        build(np.ones(300)), jnp.array([7, 7, 200, 7]), jnp.array([2.0, 3.0, 5.0, 4.0])
+    )
+    assert levels[0][0, 7] in (2, 3, 4) and levels[0][1, 200 - 128] == 5
+    assert_levels_agree(levels, np.ravel(levels[0])[:300])
+    np.testing.assert_array_equal(levels[1][0, :3], [127 + levels[0][0, 7], 127 + 5, 44])
+
+
+# Sampling
+
+WEIGHTS = {
+    "one row": np.array([0.3]),
+    "one block": np.arange(1.0, 129),
+    "not a multiple of the block": np.linspace(1, 5, 200),
+    "two levels": 1 + np.arange(1000) % 7.0,
+    "three levels": 1 + np.arange(20_000) % 5.0,
+    "extreme": np.where(np.arange(700) % 100 == 3, 1e6, 1e-6),
+    "extreme, the large ones last": np.where(np.arange(300) < 298, 1e-6, 1e6),
+    "small ones that add up": np.where(np.arange(16_512) == 5, 16_512e-6, 1e-6),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_rows_are_drawn_with_their_exact_probabilities(name):
+    weights, draws = WEIGHTS[name], 100_000
+    rows = np.asarray(drawer(draws)(jax.random.key(3), build(weights)))
+    assert rows.min() >= 0 and rows.max() < len(weights)
+    probability = weights / weights.sum()
+    # Cells of at least 20 expected draws: neighbouring rows together, where one alone is too unlikely.
+    cell = np.floor(np.cumsum(probability) * draws / 20).astype(int)
+    cell = np.unique(np.append(0, cell[:-1]), return_inverse=True)[1]
+    expected = np.bincount(cell, probability) * draws
+    counts = np.bincount(cell[rows], minlength=len(expected))
+    enough = expected >= 5
+    assert counts[~enough].sum() <= 10 * (1 + expected[~enough].sum())
+    observed, theory = np.append(counts[enough], counts[~enough].sum()), expected[enough]
+    theory = np.append(theory, draws - theory.sum())
+    kept = theory > 1e-3
+    assert kept.sum() == 1 or stats.chisquare(observed[kept], theory[kept] * draws / theory[kept].sum()).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("block", range(2))
+def test_within_a_block_each_row_has_its_own_probability(block):
+    """Cell by cell, without the grouping of the test above; the other block makes up half of all draws."""
+    weights = np.concatenate([np.arange(1.0, 129), np.full(72, 128 * 129 / 2 / 72)])
+    rows = np.asarray(drawer(100_000)(jax.random.key(4), build(weights)))
+    own = rows[rows // 128 == block] % 128
+    expected = weights[128 * block : 128 * (block + 1)] / weights[:128].sum()
+    assert stats.chisquare(np.bincount(own, minlength=len(expected)), expected * len(own)).pvalue > 1e-3
+    assert abs(len(own) - 50_000) < 5 * 160
+
+
+def uniform_draws(monkeypatch, value):
+    def draws(key, shape):
+        del key
+        return jnp.full(shape, value, jnp.float32)
+
+    monkeypatch.setattr(jax.random, "uniform", draws)
+
+
+LARGEST_DRAW = 1 - 2**-23  # what `jax.random.uniform` gives at most
+
+
+@pytest.mark.parametrize("u", [0.0, 1e-30, 0.5, LARGEST_DRAW])
+@pytest.mark.parametrize("rows", [1, 3, 128, 129, 150, 16_385])
+@pytest.mark.parametrize("large", [1.0, 1e6])
+def test_an_empty_row_is_never_drawn(monkeypatch, u, rows, large):
+    """A mostly empty buffer of a million rows, at the edges of the random numbers."""
+    uniform_draws(monkeypatch, u)
+    priorities = np.resize([1e-6, large, 0.7, 3.3, 11.1], rows)
+    levels = tuple(jnp.zeros(shape) for shape in [(7813, 128), (62, 128), (1, 128)])
+    levels = tuple(level.at[: len(own)].set(own) for level, own in zip(levels, build(priorities), strict=False))
+    if len(levels) > len(build(priorities)):  # the levels above are those of the whole buffer
+        levels = build(np.ravel(levels[0])[:1_000_000])
+    row = lap.draw_rows(jax.random.key(0), levels, 4)
+    assert np.all(row >= 0) and np.all(row < rows)
+
+
+def test_an_empty_row_is_never_drawn_whatever_the_order_of_summation(monkeypatch):
+    """Accelerators sum prefixes as trees: rounding may then let the cumulative sum grow where a weight is 0."""
+    cumsum = jax.jit(lambda x, axis: jax.lax.associative_scan(jnp.add, x, axis=axis), static_argnames="axis")
+    monkeypatch.setattr(jnp, "cumsum", lambda x, axis: cumsum(x, axis=axis % x.ndim))
+    uniform_draws(monkeypatch, LARGEST_DRAW)
+    generator = np.random.default_rng(0)
+    weights = generator.uniform(0.5, 20, size=(4096, 128)).astype(np.float32)
+    weights[np.arange(128) >= generator.integers(1, 128, size=(4096, 1))] = 0  # a start of each block is filled
+    grows = np.diff(np.asarray(jnp.cumsum(weights, axis=-1)), axis=-1) != 0
+    assert np.any(grows & (weights[:, 1:] == 0))  # so it does happen
+    chosen = lap.draw(jax.random.key(0), jnp.asarray(weights))
+    assert np.all(weights[np.arange(4096), chosen] > 0)
+
+
+def test_a_batch_holds_the_rows_that_were_drawn():
+    init, insert, sample, _ = compiled()
+    state = filled(125)
+    for seed in range(20):
+        batch, rows = sample(state, jax.random.key(seed))
+        assert rows.shape == (BATCH,) and rows.dtype == jnp.int32
+        for ours, expected in zip(batch, transitions(np.asarray(rows) + 1), strict=True):
+            np.testing.assert_array_equal(ours, expected)
+        assert batch.reward.min() > 0  # an empty row's is 0
+
+
+def test_another_key_draws_other_rows_and_levels_have_draws_of_their_own():
+    levels = build(np.ones(128 * 128))
+    first, again, other = (np.asarray(drawer(20_000)(jax.random.key(seed), levels)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert np.mean(first == other) < 0.01
+    assert abs(np.corrcoef(first // 128, first % 128)[0, 1]) < 0.05
+
+
+# Priorities
+
+
+def test_the_priority_is_the_clipped_error_to_the_power(maybe_jit):
+    error = jnp.array([0.0, 0.5, 1.0, 32.0])
+    compute = maybe_jit(lambda error: lap.priority(error, 0.4, 1.0))
+    np.testing.assert_allclose(compute(error), [1, 1, 1, 4], rtol=1e-6)  # 32^0.4 = 2^2
+    np.testing.assert_allclose(lap.priority(error, 0.4, 0.03125), [0.25, 2**-0.4, 1, 4], rtol=1e-6)
+    np.testing.assert_array_equal(lap.priority(error, 0.0, 1.0), np.ones(4))
+
+
+def test_feedback_sets_the_priorities_of_its_rows_alone():
+    *_, feedback = compiled()
+    rows = np.arange(0, 960, 60, dtype=np.int32)
+    state = feedback(filled(), rows, jnp.full(BATCH, 32.0), jnp.int32(1))
+    expected = np.ones(CAPACITY)
+    expected[rows] = 4
+    np.testing.assert_allclose(np.ravel(state.levels[0])[:CAPACITY], expected, rtol=1e-6)
+    assert np.all(np.ravel(state.levels[0])[CAPACITY:] == 0)
+
+
+def give(state, error, gradient_steps, rows=0):
+    """Feedback of one error for rows `rows`, `rows` + 1, ..."""
+    *_, feedback = compiled()
+    return feedback(state, rows + jnp.arange(BATCH), jnp.full(BATCH, error), jnp.int32(gradient_steps))
+
+
+def test_new_rows_get_the_largest_priority_seen():
+    _, insert, *_ = compiled()
+    state = filled(100)
+    assert state.max_priority == 1 and np.all(np.ravel(state.levels[0])[:100] == 1)
+    state = give(state, 32.0, 1)
+    np.testing.assert_allclose(state.max_priority, 4, rtol=1e-6)
+    state = give(state, 0.0, 2)  # a smaller one later does not lower it, though no row has it any more
+    state = insert(state, transitions(range(101, 201)))
+    priorities = np.ravel(state.levels[0])
+    np.testing.assert_allclose(priorities[100:200], 4, rtol=1e-6)
+    np.testing.assert_array_equal(priorities[:100], 1)
+    np.testing.assert_array_equal(priorities[200:], 0)
+
+
+def test_every_few_updates_alone_the_maximum_becomes_the_buffers():
+    state, seen = filled(100), []
+    for k, error in enumerate([1.0, 32.0, 1.0, 1.0, 1.0, 1.0, 243.0, 1.0], start=1):
+        state = give(state, error, k)
+        seen.append(float(state.max_priority))
+    # REFRESH = 4: at 4 and 8 nothing above 1 is left in the buffer
+    np.testing.assert_allclose(seen, [1, 4, 4, 1, 1, 1, 9, 1], rtol=1e-5)
+
+
+def test_a_refresh_sees_rows_outside_the_batch_and_the_batch_itself():
+    state = give(filled(), 32.0, 1)
+    np.testing.assert_allclose(give(state, 243.0, 4).max_priority, 9, rtol=1e-5)
+    np.testing.assert_allclose(give(state, 1.0, 4, rows=500).max_priority, 4, rtol=1e-6)
+
+
+def test_a_row_that_is_overwritten_loses_its_old_priority():
+    _, insert, *_ = compiled()
+    state = give(give(filled(), 32.0, 1), 1.0, 4, rows=500)._replace(max_priority=jnp.float32(2))
+    state = insert(state, transitions([1001]))
+    np.testing.assert_allclose(np.ravel(state.levels[0])[:3], [2, 4, 4], rtol=1e-6)
+    assert_levels_agree(state.levels, np.ravel(state.levels[0])[:CAPACITY])
+
+
+def test_an_insert_that_could_straddle_the_end_is_refused():
+    buffer = lap.lap(CAPACITY, BATCH, O, A)
+    with pytest.raises(ValueError, match="multiple of the rows inserted at once .3."):
+        buffer.insert(buffer.init(), transitions([1, 2, 3]))
+
+
+# Cost
+
+MEMBERS = 3
+AXES = lap.LapState(replay.UniformState(storage=0, pointer=None, size=None), levels=0, max_priority=0)
+
+
+def training_loop(capacity):
+    """Insert, sample and feedback of a sweep's members in a loop, compiled as in the training program."""
+    buffer = lap.lap(capacity, 64, O, A)
+    insert = jax.vmap(buffer.insert, in_axes=(AXES, 0), out_axes=AXES)
+    sample = jax.vmap(buffer.sample, in_axes=(AXES, 0))
+    feedback = jax.vmap(buffer.feedback, in_axes=(AXES, 0, 0, None), out_axes=AXES)
+
+    def loop(state, transition, key):
+        def body(i, state):
+            state = insert(state, transition)
+            batch, rows = sample(state, jax.random.split(jax.random.fold_in(key, i), MEMBERS))
+            return feedback(state, rows, jnp.abs(batch.reward), i)
+
+        return jax.lax.fori_loop(0, 1000, body, state)
+
+    state = jax.eval_shape(jax.vmap(lambda _: buffer.init(), out_axes=AXES), jnp.arange(MEMBERS))
+    new = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, transitions(np.ones((MEMBERS, 1)))))
+    executable = jax.jit(loop, donate_argnums=0).lower(state, new, jax.random.key(0)).compile()
+    return state, executable
+
+
+@pytest.fixture(scope="module")
+def loops():
+    """Both capacities have three levels."""
+    return {capacity: training_loop(capacity) for capacity in (300_000, 1_000_000)}
+
+
+def held_shapes(state):
+    """What grows with the capacity, as the compiled text writes it."""
+    return ["f32[" + ",".join(map(str, leaf.shape)) + "]" for leaf in (state.rows.storage, *state.levels[:-1])]
+
+
+def instructions(text):
+    """(computation, name, shape, operation, line) of each instruction of a compiled text."""
+    computation, found = "", []
+    for line in text.splitlines():
+        if head := re.match(r"(?:ENTRY )?%([\w.-]+) \(.*\{$", line):
+            computation = head[1]
+        elif line_parts := re.match(r"\s+(?:ROOT )?%([\w.-]+) = (\w+\[[\d,]*\])\S* ([\w-]+)\(", line):
+            found.append((computation, *line_parts.groups(), line))
+    return found
+
+
+def test_the_loop_over_members_writes_priorities_and_storage_in_place(loops):
+    for state, executable in loops.values():
+        lines = instructions(executable.as_text())
+        for shape in held_shapes(state):
+            kinds = {operation for _, _, own, operation, _ in lines if own == shape}
+            assert kinds & {"scatter", "dynamic-update-slice"}, shape
+            assert kinds <= {"scatter", "dynamic-update-slice", "fusion", "get-tuple-element", "parameter"}, kinds
+        size = sum(4 * int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(state))
+        assert executable.memory_analysis().alias_size_in_bytes == size  # the result is the donated argument
+
+
+def test_only_the_rare_refresh_reads_all_priorities(loops):
+    """What sums or compares over a whole level lies in a branch, or in a kernel that branches alone call."""
+    for state, executable in loops.values():
+        text = executable.as_text()
+        lines = instructions(text)
+        branches = set(re.findall(r"%([\w.-]+)", " ".join(re.findall(r"branch_computations=\{(.*?)\}", text))))
+        callers: dict[str, set[str]] = {}
+        for computation, *_, line in lines:
+            for called in re.findall(r"calls=%([\w.-]+)", line):
+                callers.setdefault(called, set()).add(computation)
+        priorities = held_shapes(state)[1]
+        for shape in held_shapes(state):
+            names = {(computation, name) for computation, name, own, *_ in lines if own == shape}
+            readers = {
+                computation
+                for computation, _, _, operation, line in lines
+                for name in re.findall(r"%([\w.-]+)", line)
+                if operation in ("reduce", "reduce-window") and (computation, name) in names
+            }
+            assert all(reader in branches or callers.get(reader, {""}) <= branches for reader in readers), shape
+            assert bool(readers) == (shape == priorities)  # the refresh's maximum
+
+
+def test_nothing_else_grows_with_the_capacity(loops):
+    """The two programs are the same but for the shapes of what the state holds."""
+    programs = {}
+    for capacity, (state, executable) in loops.items():
+        held = held_shapes(state)
+        shapes = [
+            (operation, held.index(shape) if shape in held else shape)
+            for _, _, shape, operation, _ in instructions(executable.as_text())
+        ]
+        programs[capacity] = sorted(map(str, shapes))
+    small, large = programs.values()
+    assert len(small) > 100 and small == large
+    scratch = [executable.memory_analysis().temp_size_in_bytes for _, executable in loops.values()]
+    assert max(scratch) - min(scratch) < 1000 and max(scratch) < 1_000_000
