@@ -222,7 +222,7 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     try:
         rest = values(list(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
-        hint = nearest(error.flagname, [flag.name for flag in known]) or "; --help lists the flags"
+        hint = nearest(f"--{error.flagname}", [f"--{flag.name}" for flag in known]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
     except (absl_flags.Error, ValueError) as error:
         text = str(error).removeprefix("flag ").removeprefix("ERROR:: ")
