@@ -18,15 +18,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from absl import app, flags
+from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
 from experiments import runtime
-from sqt_jax import algorithms, envs, replay, rollout, train
+from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.types import Array, Transition
 
 SUITES = ("env", "update", "replay", "loop")
+BATCH = 256
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
 flags.DEFINE_list("tasks", list(envs.TASKS), "Tasks; the suite replay takes the rows of the first one.")
@@ -128,42 +129,45 @@ def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
     return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds)
 
 
-def bench_replay(what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
-    """One insert of a row, or one sampled batch, on a full buffer."""
+REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}
+
+
+def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
+    """One insert of a row, or one sampled batch and what it feeds back, on a full buffer."""
     env = envs.make(task)
-    store = replay.uniform(capacity, 256, env.observation_size, env.action_size)
+    store = REPLAYS[kind](capacity, BATCH, env.observation_size, env.action_size)
     axes = train.member_axes(jax.eval_shape(store.init))
     obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
 
-    def insert(carry, _):
-        state, total = carry
+    def insert(state, total, key, step):
         return store.insert(state, Transition(obs, action, scalar, obs, scalar)), total
 
-    def sample(carry, key):
-        state, total = carry
-        return state, total + jnp.sum(store.sample(state, key)[0].obs)
+    def sample(state, total, key, step):
+        batch, rows = store.sample(state, key)
+        state = store.feedback(state, rows, jax.random.uniform(key, (BATCH,), maxval=3.0), step + 1)
+        return state, total + jnp.sum(batch.obs)
 
-    step = jax.vmap({"insert": insert, "sample": sample}[what], in_axes=((axes, 0), 0), out_axes=(axes, 0))
+    one = jax.vmap({"insert": insert, "sample": sample}[what], in_axes=(axes, 0, 0, None), out_axes=(axes, 0))
 
-    @functools.partial(jax.jit, donate_argnums=0)
-    def run(carry, keys, steps):
-        return jax.lax.fori_loop(
-            0, steps, lambda i, c: step(c, jax.vmap(jax.random.fold_in, (0, None))(keys, i)), carry
-        )
+    def loop(step_of, state, total, keys, steps):
+        def body(i, carry):
+            return step_of(*carry, jax.vmap(jax.random.fold_in, (0, None))(keys, i), i)
 
-    keys = member_keys(members)
-    full = jax.jit(jax.vmap(lambda _: store.init()._replace(size=jnp.int32(capacity)), out_axes=axes))(keys)
-    carry = (full, jnp.zeros(members))
+        return jax.lax.fori_loop(0, steps, body, (state, total))
+
+    run = jax.jit(functools.partial(loop, one), donate_argnums=0)
+    fill = jax.jit(functools.partial(loop, jax.vmap(insert, in_axes=(axes, 0, 0, None), out_axes=(axes, 0))))
+    keys, total = member_keys(members), jnp.zeros(members)
+    state, _ = fill(jax.jit(jax.vmap(lambda _: store.init(), out_axes=axes))(keys), total, keys, capacity)
 
     def once(steps):
-        nonlocal carry
-        carry = run(carry, keys, steps)
-        return carry
+        nonlocal state
+        state, total = run(state, jnp.zeros(members), keys, steps)
+        return total
 
     rate, compile_seconds = measure(once, **timing)
-    return Row(
-        "replay", f"{what}, {task} rows, capacity {capacity:,}", members, f"{what}s", rate * members, compile_seconds
-    )
+    name = f"{kind} {what}, {task} rows, capacity {capacity:,}"
+    return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
 
 
 def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
@@ -197,7 +201,8 @@ def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
                 yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
             elif suite == "replay":
                 yield from (
-                    bench_replay(what, tasks[0], int(size), count, **timing)
+                    bench_replay(kind, what, tasks[0], int(size), count, **timing)
+                    for kind in REPLAYS
                     for what in ("insert", "sample")
                     for size in FLAGS.capacities
                 )
@@ -228,6 +233,7 @@ def main(argv: Sequence[str]) -> None:
     unknown = [suite for suite in FLAGS.suites if suite not in SUITES]
     if unknown:
         sys.exit(f"--suites: takes some of {', '.join(SUITES)}, not {unknown[0]!r}")
+    logging.set_verbosity(logging.WARNING)
     runtime.prepare()
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     console = Console()

@@ -52,7 +52,6 @@ def target(next_q=NEXT_Q, reward=REWARD, discount=DISCOUNT, gamma=0.5, **setting
         ({"penalty": partial(q_targets.transition_std, coef=0.5)}, [1.5 - 0.25 * SQRT2, 2 - 0.5 * SQRT2, 3]),
         ({"penalty": lambda next_q: jnp.float32(7)}, [-2, -1.5, 3]),
     ],
-    ids=str,
 )
 def test_hand_worked_targets(maybe_jit, settings, expected):
     result = maybe_jit(lambda next_q: target(next_q, **settings))(NEXT_Q)

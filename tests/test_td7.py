@@ -215,7 +215,7 @@ def assess(state, learner, gradient_steps, episode_return, ended=True):
 
 
 def story(state, *episodes, gradient_steps=0, learners=range(1, 100)):
-    """(snapshot, checkpoint, best, min, episodes, assessments, refreshes) after each episode, and learner k after k."""
+    """(snapshot, checkpoint, best, min, episodes, assessments, refreshes) after each of the episodes."""
     rows = []
     for learner, episode_return in zip(learners, episodes, strict=False):
         state = assess(state, learner, gradient_steps, episode_return)
