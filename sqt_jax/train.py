@@ -96,7 +96,7 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
         timestep, transition = rollout.step(env, state.timestep, behaviour)
         over = timestep.terminated | timestep.truncated
         episodes, episode_return = state.episodes.add(transition.reward, over)
-        agent_state = agent.observe(state.agent, episode_return, over)
+        agent_state = agent.observe(state.agent, episode_return, over & learn)
         replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):

@@ -56,7 +56,7 @@ def test_temperature_auto_is_learned():
 
 
 BAD = {
-    "--stepz=5": "--stepz: unknown flag; did you mean steps?",
+    "--stepz=5": "--stepz: unknown flag; did you mean --steps?",
     "--wibble": "--wibble: unknown flag; --help lists the flags",
     "--steps=many": "--steps=many: takes a whole number",
     "--steps=1.5": "--steps=1.5: takes a whole number",
