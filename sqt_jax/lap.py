@@ -7,7 +7,6 @@ rounding errors cannot accumulate.
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -22,7 +21,6 @@ BLOCK = 128
 class LapState(NamedTuple):
     rows: replay.UniformState
     levels: tuple[Array, ...]  # [blocks, BLOCK] each: priorities, sums of their blocks, ...; the last has one block
-    maxima: tuple[Array, ...]  # as the levels above the priorities, with maxima in place of sums
     max_priority: Array  # []: what new rows get
 
 
@@ -38,30 +36,30 @@ def priority(td_error: Array, exponent: float, min_priority: float) -> Array:
     return jnp.maximum(td_error, min_priority) ** exponent
 
 
-def set_priorities(
-    levels: tuple[Array, ...], index: Array, value: Array, reduce: Callable[..., Array] = jnp.sum
-) -> tuple[Array, ...]:
+def set_priorities(levels: tuple[Array, ...], index: Array, value: Array) -> tuple[Array, ...]:
     """The priorities `value [B]` for the rows `index [B]`, and the sums above them."""
+    if index.shape[0] == 1:
+        # A scatter of one row becomes a slice update, which XLA computes again where the sum is taken: it would keep
+        # a copy of the level for that. Two rows stay a scatter, in place.
+        index, value = jnp.repeat(index, 2), jnp.repeat(value, 2)
     changed = []
     for level in levels:
         block, place = index // BLOCK, index % BLOCK
         level = level.at[block, place].set(value)
         changed.append(level)
-        index, value = block, reduce(level[block], axis=-1)
+        index, value = block, jnp.sum(level[block], axis=-1)
     return tuple(changed)
 
 
 def draw(key: Array, weights: Array) -> Array:
     """For each row of `weights [B, K]` an index with probability proportional to its weight: [B].
 
-    Never one of weight 0, whatever the rounding: a parallel cumulative sum may even fall or rise at such a one.
+    Never one of weight 0, whatever the order in which the cumulative sum is rounded: such rows do not count, and the
+    threshold is below the highest of the others.
     """
-    cumulative = jnp.cumsum(weights, axis=-1)
-    threshold = cumulative[:, -1:] * jax.random.uniform(key, (weights.shape[0], 1))
-    possible = weights > 0
-    above = possible & (cumulative > threshold)
-    last = weights.shape[-1] - 1 - jnp.argmax(possible[:, ::-1], axis=-1)
-    return jnp.where(jnp.any(above, axis=-1), jnp.argmax(above, axis=-1), last)
+    reached = jnp.where(weights > 0, jnp.cumsum(weights, axis=-1), 0.0)
+    threshold = jnp.max(reached, axis=-1, keepdims=True) * jax.random.uniform(key, (weights.shape[0], 1))
+    return jnp.argmax(reached > threshold, axis=-1)
 
 
 def draw_rows(key: Array, levels: tuple[Array, ...], batch_size: int) -> Array:
@@ -89,18 +87,12 @@ def lap(
 
     def init() -> LapState:
         levels = tuple(jnp.zeros(shape) for shape in _shapes(capacity))
-        return LapState(store.init(), levels, levels[1:], jnp.ones(()))
-
-    def assign(state: LapState, index: Array, value: Array) -> LapState:
-        levels = set_priorities(state.levels, index, value)
-        highest = jnp.max(levels[0][index // BLOCK], axis=-1)
-        maxima = set_priorities(state.maxima, index // BLOCK, highest, jnp.max)
-        return state._replace(levels=levels, maxima=maxima)
+        return LapState(store.init(), levels, jnp.ones(()))
 
     def insert(state: LapState, transition: Transition) -> LapState:
         index = state.rows.pointer + jnp.arange(transition.reward.shape[0])
-        state = assign(state, index, jnp.broadcast_to(state.max_priority, index.shape))
-        return state._replace(rows=store.insert(state.rows, transition))
+        levels = set_priorities(state.levels, index, jnp.broadcast_to(state.max_priority, index.shape))
+        return LapState(store.insert(state.rows, transition), levels, state.max_priority)
 
     def sample(state: LapState, key: Array) -> tuple[Transition, Array]:
         index = draw_rows(key, state.levels, batch_size)
@@ -108,10 +100,11 @@ def lap(
 
     def feedback(state: LapState, index: Array, td_error: Array, gradient_steps: Array) -> LapState:
         new = priority(td_error, priority_exponent, min_priority)
-        state = assign(state, index, new)
-        highest = jnp.max(state.maxima[-1] if state.maxima else state.levels[0])
+        levels = set_priorities(state.levels, index, new)
+        highest = jnp.maximum(state.max_priority, jnp.max(new))
+        # A scalar that members share: a real branch under vmap, taken rarely, since it reads every priority.
         refresh = gradient_steps % refresh_every == 0
-        running = jnp.maximum(state.max_priority, jnp.max(new))
-        return state._replace(max_priority=jnp.where(refresh, highest, running))
+        highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
+        return LapState(state.rows, levels, highest)
 
     return Replay(init, insert, sample, feedback)

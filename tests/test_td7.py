@@ -433,9 +433,6 @@ def test_the_replay_learns_its_priorities(trained):
     np.testing.assert_allclose(np.sum(levels[-1], axis=(1, 2)), priorities.sum(axis=1), rtol=1e-5)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="XLA's CPU backend copies the priorities (4 bytes a row) once per update: BUILD_NOTES.md"
-)
 def test_the_train_loop_copies_neither_storage_nor_priorities(trained):
     state = trained.final
     text = trained.sweep.advance.lower(state, 1, True).compile().as_text()
