@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from absl import flags as absl_flags
 
 from experiments.presets import PRESETS
-from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check_value
+from sqt_jax.config import TD7_SETTINGS, AgentConfig, Config, ConfigError, TrainConfig, check_value
 from sqt_jax.names import nearest
 from sqt_jax.types import Scalars
 
@@ -37,19 +37,19 @@ SETTING_HELP = {
     "penalty_coef": "weight of the disagreement penalty, the paper's alpha",
     "ddof": "the std over critics divides by N - ddof",
     "penalty_inside_gamma": "discount and mask the penalty with the bootstrapped value",
-    "reduce": "critics to one target value: min, mean or subset_min (REDQ)",
+    "reduce": "how the target critics' values become one: min, mean or subset_min (REDQ)",
     "subset_size": "critics drawn per update by --reduce=subset_min",
     "ensemble_size": "number of critics",
     "hidden": "widths of the hidden layers",
     "lr": "Adam's learning rate",
     "gamma": "discount factor",
-    "tau": "step of the target networks",
+    "tau": "soft-update rate of the target networks",
     "policy_delay": "critic updates per actor update",
     "actor_reduce": "what the actor maximises of the critics: mean, min or first",
     "exploration_noise": "TD3, TD7: std of the noise on actions",
     "target_noise": "TD3, TD7: std of the noise on target actions",
     "target_noise_clip": "TD3, TD7: limit of that noise",
-    "temperature": "SAC: weight of the entropy; 'auto' learns it",
+    "temperature": "SAC: weight of the entropy; 'auto' learns it from 0.2 on",
     "embedding_size": "size of the state and state-action embeddings",
     "target_update_period": "updates between copies into the target networks",
     "priority_exponent": "replay: a transition's priority is its TD error to this power",
@@ -58,16 +58,6 @@ SETTING_HELP = {
     "assessment_episodes": "episodes of an assessment from then on",
     "checkpoint_reset_weight": "factor of the best assessment so far at that switch",
 }
-# The settings that td7 alone has, in a group of their own.
-TD7_SETTINGS = (
-    "embedding_size",
-    "target_update_period",
-    "priority_exponent",
-    "min_priority",
-    "checkpoint_switch",
-    "assessment_episodes",
-    "checkpoint_reset_weight",
-)
 # Chosen by --algo and by --temperature=auto, or not a setting of its own.
 NOT_FLAGS = ("penalty", "learn_temperature", "algo", "env", "agent", "train")
 # Where the algorithms' own defaults differ from the dataclass's.
@@ -175,7 +165,7 @@ FLAGS: dict[str, list[_Flag]] = {
             "seeds",
             _list_of(_integer),
             "whole numbers like 0,1,2",
-            "random seeds; each is one member per value of a list",
+            "random seeds, one member each (times the values of swept settings)",
             ",".join(map(str, DEFAULT_SEEDS)),
         ),
         _Flag("preset", str, f"one of {', '.join(PRESETS)}", "bundle of settings; flags win over it", "paper"),

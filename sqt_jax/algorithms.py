@@ -13,7 +13,7 @@ import jax
 
 from sqt_jax import envs, lap, replay, train
 from sqt_jax.agents import sac, td3, td7
-from sqt_jax.config import AgentConfig, Config, ConfigError, TrainConfig, check_agent, check_train
+from sqt_jax.config import TD7_SETTINGS, AgentConfig, Config, ConfigError, TrainConfig, check_agent, check_train
 from sqt_jax.names import nearest, unknown
 from sqt_jax.types import Agent, Environment, Replay
 
@@ -31,17 +31,6 @@ class Algorithm(NamedTuple):
 
 TEMPERATURE = frozenset({"temperature", "learn_temperature"})
 NOISE = frozenset({"exploration_noise", "target_noise", "target_noise_clip"})
-SALE_AND_LAP = frozenset(
-    {
-        "embedding_size",
-        "target_update_period",
-        "priority_exponent",
-        "min_priority",
-        "checkpoint_switch",
-        "assessment_episodes",
-        "checkpoint_reset_weight",
-    }
-)
 
 SQT = {"penalty": "batch_std", "penalty_coef": 0.5}
 SQT_TUPLE = {"penalty": "transition_std", "penalty_coef": 0.1}
@@ -52,11 +41,11 @@ REDQ = {"ensemble_size": 10, "reduce": "subset_min", "subset_size": 2}  # https:
 
 
 def _td3(settings: dict[str, Any]) -> Algorithm:
-    return Algorithm(td3.make, TD3 | settings, ignores=TEMPERATURE | SALE_AND_LAP)
+    return Algorithm(td3.make, TD3 | settings, ignores=TEMPERATURE.union(TD7_SETTINGS))
 
 
 def _sac(settings: dict[str, Any], **training: Any) -> Algorithm:
-    return Algorithm(sac.make, settings, training, ignores=NOISE | SALE_AND_LAP)
+    return Algorithm(sac.make, settings, training, ignores=NOISE.union(TD7_SETTINGS))
 
 
 def _td7(settings: dict[str, Any]) -> Algorithm:

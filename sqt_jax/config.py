@@ -58,6 +58,18 @@ class AgentConfig:
         return Scalars(**{name: getattr(self, name) for name in Scalars._fields})
 
 
+# The settings that TD7 alone has.
+TD7_SETTINGS = (
+    "embedding_size",
+    "target_update_period",
+    "priority_exponent",
+    "min_priority",
+    "checkpoint_switch",
+    "assessment_episodes",
+    "checkpoint_reset_weight",
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """How an agent is trained. Steps are environment steps (transitions) of one member."""

@@ -15,7 +15,7 @@ from sqt_jax.config import AgentConfig
 from sqt_jax.train import member_axes
 from sqt_jax.types import Agent, Scalars, Transition
 
-O, A, B = 3, 2, 16  # noqa: E741
+O, A, B = 3, 2, 16
 KEY = jax.random.key(0)
 VARIANTS = [name for name in ALGORITHMS if "_sqt" in name]
 PLAIN = [name for name in ALGORITHMS if "_sqt" not in name]

@@ -149,6 +149,11 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
     assert [group["temperature"] for group in summary["groups"]] == [0.2, 1e38]
     assert summary["env_steps"] == 120
     assert "member 2 diverged" in capsys.readouterr().out
+    # What a diverged member returns says nothing: no row, mean or score counts it; those of the others stay.
+    rows = rows_of(tmp_path / "ant" / "sac_sqt" / "run" / "evaluations.csv")
+    late = [row for row in rows if row["env_steps"] != "0"]
+    assert {row["member"] for row in late if row["return_mean"]} == {"0", "1"}
+    assert [group["final"]["mean"] is None for group in summary["groups"]] == [False, True]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -48,7 +48,9 @@ def play(actions, key=0, env=ENV):
 
 
 def leaves(timestep):
-    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    def is_key(x):
+        return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
     return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(timestep)]
 
 

@@ -15,7 +15,9 @@ from sqt_jax.envs.physics import PHYSICS, Physics, PhysicsState
 
 
 def state(qpos=(0.0,), qvel=(0.0,), displacement=0.0, quantities=None):
-    array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    def array(x):
+        return jnp.asarray(x, jnp.float32)
+
     return PhysicsState(array(qpos), array(qvel), array(displacement), quantities or {}, ())
 
 

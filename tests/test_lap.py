@@ -16,7 +16,7 @@ from sqt_jax.types import Transition
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 
-O, A = 2, 1  # noqa: E741
+O, A = 2, 1
 EXPONENT, MIN_PRIORITY, REFRESH = 0.4, 1.0, 4
 CAPACITY, BATCH = 1000, 16  # 1000 rows: 7 full blocks and one of 104 rows
 

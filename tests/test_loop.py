@@ -143,6 +143,9 @@ def test_a_member_with_numbers_that_are_not_finite_is_named_once():
     assert outcome.diverged == {1: 1_000}
     assert recorder.messages == ["member 1 diverged: not all its numbers are finite at step 1,000"]
     assert not outcome.interrupted and outcome.env_steps == 2_000
+    for report in recorder.reports:
+        assert np.isnan(report.returns[1]).all() == (report.env_steps >= 1_000)
+        assert np.isfinite(report.returns[0]).all()
 
 
 def test_interval_metrics_weigh_steps_and_episodes():

@@ -11,7 +11,7 @@ from sqt_jax import networks
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 
 # All different, so that no axis can be taken for another.
-O, A, B, N, HIDDEN = 3, 2, 4, 5, (7, 6)  # noqa: E741
+O, A, B, N, HIDDEN = 3, 2, 4, 5, (7, 6)
 KEY = jax.random.key(0)
 OBS = jax.random.normal(jax.random.key(1), (B, O))
 ACTION = jax.random.uniform(jax.random.key(2), (B, A), minval=-1.0)

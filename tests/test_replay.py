@@ -17,7 +17,7 @@ from sqt_jax.types import Transition
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 
-O, A, BATCH = 3, 2, 32  # noqa: E741
+O, A, BATCH = 3, 2, 32
 CAPACITY = 6
 
 

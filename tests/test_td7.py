@@ -17,7 +17,7 @@ from sqt_jax.envs.autoreset import make_environment
 from sqt_jax.train import Sweep, TrainState, make_sweep
 from sqt_jax.types import Agent, Transition
 
-O, A, B, N, Z = 3, 2, 8, 2, 6  # noqa: E741
+O, A, B, N, Z = 3, 2, 8, 2, 6
 KEY = jax.random.key(0)
 PERIOD, SWITCH = 3, 4
 CONFIG = AgentConfig(
