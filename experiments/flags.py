@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from absl import flags as absl_flags
 
 from experiments.presets import PRESETS
-from sqt_jax.config import TD7_SETTINGS, AgentConfig, Config, ConfigError, TrainConfig, check_value
+from sqt_jax.config import SALE_SETTINGS, TD7_SETTINGS, AgentConfig, Config, ConfigError, TrainConfig, check_value
 from sqt_jax.names import nearest
 from sqt_jax.types import Scalars
 
@@ -41,6 +41,7 @@ SETTING_HELP = {
     "subset_size": "critics drawn per update by --reduce=subset_min",
     "ensemble_size": "number of critics",
     "hidden": "widths of the hidden layers",
+    "networks": "mlp, or sale: TD7's, with its critic loss and its hard target copies",
     "lr": "Adam's learning rate",
     "gamma": "discount factor",
     "tau": "soft-update rate of the target networks",
@@ -49,7 +50,11 @@ SETTING_HELP = {
     "exploration_noise": "TD3, TD7: std of the noise on actions",
     "target_noise": "TD3, TD7: std of the noise on target actions",
     "target_noise_clip": "TD3, TD7: limit of that noise",
+    "sampled_actor": "TD3, TD7: a Gaussian actor, updated by its samples; its mode acts",
     "temperature": "SAC: weight of the entropy; 'auto' learns it from 0.2 on",
+    "squashed_log_prob": "SAC: log-probabilities are the action's; else the Gaussian's, averaged over dimensions",
+    "train_encoder": "train the encoder of the embeddings; else it stays as it started",
+    "value_clipping": "clip the bootstrapped value to the range of the targets seen so far",
     "embedding_size": "size of the state and state-action embeddings",
     "target_update_period": "updates between copies into the target networks",
     "priority_exponent": "replay: a transition's priority is its TD error to this power",
@@ -67,6 +72,7 @@ DEFAULT_TEXT = {
     "ensemble_size": "2; 4 for maxmin, 10 for redq",
     "reduce": "min; subset_min for redq",
     "updates_per_step": "1; 5 for redq",
+    "networks": "mlp; sale for td7",
 }
 
 
@@ -172,8 +178,9 @@ FLAGS: dict[str, list[_Flag]] = {
     ],
     "Training": _settings(TrainConfig),
     "Algorithm (the scalars " + ", ".join(Scalars._fields) + " take lists)": [
-        flag for flag in _settings(AgentConfig) if flag.name not in TD7_SETTINGS
+        flag for flag in _settings(AgentConfig) if flag.name not in SALE_SETTINGS + TD7_SETTINGS
     ],
+    "SALE networks (TD7; --networks=sale)": [flag for flag in _settings(AgentConfig) if flag.name in SALE_SETTINGS],
     "TD7": [flag for flag in _settings(AgentConfig) if flag.name in TD7_SETTINGS],
     "Output": [
         _Flag("out", str, "a folder", "results go to OUT/ENV/ALGO/NAME/", "runs"),

@@ -1,7 +1,11 @@
 """Named bundles of settings: `--preset=NAME`. A flag given on the command line wins over its preset."""
 
+import functools
+import operator
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
+
+from sqt_jax.config import ConfigError
 
 
 class Row(NamedTuple):
@@ -11,6 +15,10 @@ class Row(NamedTuple):
     algo: str = "*"
     env: str = "*"
 
+
+# What the authors' released code trains under the names of TD3 and SAC: TD7's update around their actions, with an
+# encoder that is never trained.
+UNTRAINED_SALE = {"networks": "sale", "train_encoder": False, "value_clipping": False}
 
 # Later rows win over earlier ones.
 PRESETS: dict[str, tuple[Row, ...]] = {
@@ -29,13 +37,24 @@ PRESETS: dict[str, tuple[Row, ...]] = {
             }
         ),
     ),
+    # The authors' released code (BUILD_NOTES.md, "What is trained").
+    "released": (
+        Row(UNTRAINED_SALE | {"sampled_actor": True}, algo="td3*"),
+        Row(UNTRAINED_SALE | {"policy_delay": 2, "squashed_log_prob": False}, algo="sac*"),
+        Row({"sampled_actor": True, "updates_per_step": 2}, algo="td7*"),
+        Row({"penalty_coef": 1.0}, algo="td?_sqt*"),
+        Row({"penalty_coef": 1.0}, algo="sac_sqt*"),
+    ),
 }
 
 
 def preset_settings(preset: str, algo: str, env: str) -> dict[str, Any]:
-    """The settings of a preset for one algorithm and environment (by their own names, not aliases)."""
-    merged: dict[str, Any] = {}
-    for row in PRESETS[preset]:
-        if fnmatchcase(algo, row.algo) and fnmatchcase(env, row.env):
-            merged |= row.settings
-    return merged
+    """The settings of a preset for one algorithm and environment (by their own names, not aliases).
+
+    Raises:
+      ConfigError: the preset says nothing of this algorithm and environment.
+    """
+    rows = [row for row in PRESETS[preset] if fnmatchcase(algo, row.algo) and fnmatchcase(env, row.env)]
+    if PRESETS[preset] and not rows:
+        raise ConfigError("preset", f"{preset} has no settings for {algo} on {env}")
+    return functools.reduce(operator.or_, (row.settings for row in rows), {})

@@ -13,7 +13,16 @@ import jax
 
 from sqt_jax import envs, lap, replay, train
 from sqt_jax.agents import sac, td3, td7
-from sqt_jax.config import TD7_SETTINGS, AgentConfig, Config, ConfigError, TrainConfig, check_agent, check_train
+from sqt_jax.config import (
+    SALE_SETTINGS,
+    TD7_SETTINGS,
+    AgentConfig,
+    Config,
+    ConfigError,
+    TrainConfig,
+    check_agent,
+    check_train,
+)
 from sqt_jax.names import nearest, unknown
 from sqt_jax.types import Agent, Environment, Replay
 
@@ -25,31 +34,44 @@ class Algorithm(NamedTuple):
     settings: dict[str, Any]  # where the row differs from AgentConfig's defaults
     training: Mapping[str, Any] = MappingProxyType({})  # and from TrainConfig's
     ignores: frozenset[str] = frozenset()  # settings that have no effect
-    prioritised: bool = False  # LAP instead of uniform replay
-    single_env: bool = False  # one environment per member: its assessments belong to one stream of episodes
+    assessed: bool = False  # TD7: LAP replay, and policy checkpoints, which take one stream of episodes
 
 
-TEMPERATURE = frozenset({"temperature", "learn_temperature"})
-NOISE = frozenset({"exploration_noise", "target_noise", "target_noise_clip"})
+TEMPERATURE = frozenset({"temperature", "learn_temperature", "squashed_log_prob"})
+NOISE = frozenset({"exploration_noise", "target_noise", "target_noise_clip", "sampled_actor"})
+# What has no effect with the networks of a kind.
+IGNORED_WITH = {"mlp": frozenset(SALE_SETTINGS), "sale": frozenset({"tau", "learn_temperature"})}
 
 SQT = {"penalty": "batch_std", "penalty_coef": 0.5}
 SQT_TUPLE = {"penalty": "transition_std", "penalty_coef": 0.1}
 TD3 = {"policy_delay": 2}
-TD7 = {"policy_delay": 2}
+TD7 = {"policy_delay": 2, "networks": "sale"}
 MAXMIN = {"ensemble_size": 4}  # https://arxiv.org/abs/2002.06487
 REDQ = {"ensemble_size": 10, "reduce": "subset_min", "subset_size": 2}  # https://arxiv.org/abs/2101.05982
 
 
+def _make_td3(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
+    if config.networks == "sale":
+        return td7.make_sale_agent(config, observation_size, action_size, td3.actions(config), assessed=False)
+    return td3.make(config, observation_size, action_size)
+
+
+def _make_sac(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
+    if config.networks == "sale":
+        return td7.make_sale_agent(config, observation_size, action_size, sac.actions(config), assessed=False)
+    return sac.make(config, observation_size, action_size)
+
+
 def _td3(settings: dict[str, Any]) -> Algorithm:
-    return Algorithm(td3.make, TD3 | settings, ignores=TEMPERATURE.union(TD7_SETTINGS))
+    return Algorithm(_make_td3, TD3 | settings, ignores=TEMPERATURE.union(TD7_SETTINGS))
 
 
 def _sac(settings: dict[str, Any], **training: Any) -> Algorithm:
-    return Algorithm(sac.make, settings, training, ignores=NOISE.union(TD7_SETTINGS))
+    return Algorithm(_make_sac, settings, training, ignores=NOISE.union(TD7_SETTINGS))
 
 
 def _td7(settings: dict[str, Any]) -> Algorithm:
-    return Algorithm(td7.make, TD7 | settings, ignores=TEMPERATURE | {"tau"}, prioritised=True, single_env=True)
+    return Algorithm(td7.make, TD7 | settings, ignores=TEMPERATURE | {"tau"}, assessed=True)
 
 
 ALGORITHMS: dict[str, Algorithm] = {
@@ -89,11 +111,15 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
     _refuse_unknown(settings, AGENT_SETTINGS)
     if isinstance(settings.get("hidden"), list):  # out of a JSON file
         settings["hidden"] = tuple(settings["hidden"])
-    config = AgentConfig(**ALGORITHMS[algo].settings | settings)
-    for name in ALGORITHMS[algo].ignores & settings.keys():
-        if settings[name] != getattr(AgentConfig, name):  # the default may be named: config.json names everything
-            raise ConfigError(name.removeprefix("learn_"), f"has no effect with {algo}")
+    row = ALGORITHMS[algo]
+    config = AgentConfig(**row.settings | settings)
     check_agent(algo, config)
+    if row.assessed and config.networks != "sale":
+        raise ConfigError("networks", f"takes sale for {algo}")
+    for ignored, cause in ((row.ignores, algo), (IGNORED_WITH[config.networks], f"--networks={config.networks}")):
+        for name in ignored & settings.keys():
+            if settings[name] != getattr(AgentConfig, name):  # the default may be named: config.json names everything
+                raise ConfigError(name.removeprefix("learn_"), f"has no effect with {cause}")
     return config
 
 
@@ -121,7 +147,7 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
         raise ConfigError("physics", unknown(physics, envs.PHYSICS))
     train_config = TrainConfig(**{**ALGORITHMS[algo].training, **training})
     check_train(train_config)
-    if ALGORITHMS[algo].single_env and train_config.num_envs > 1:
+    if ALGORITHMS[algo].assessed and train_config.num_envs > 1:
         raise ConfigError("num_envs", f"takes 1 for {algo}, whose policies are assessed one episode after another")
     return Config(algo, env, physics, agent, train_config)
 
@@ -147,7 +173,7 @@ def agent_of(config: Config, env: Environment) -> Agent:
 def replay_of(config: Config, env: Environment) -> Replay:
     """The replay buffer of an experiment, for an environment's sizes."""
     sizes = (config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
-    if not ALGORITHMS[config.algo].prioritised:
+    if not ALGORITHMS[config.algo].assessed:
         return replay.uniform(*sizes)
     agent = config.agent
     return lap.lap(*sizes, agent.priority_exponent, agent.min_priority, agent.target_update_period)

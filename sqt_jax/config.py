@@ -32,6 +32,7 @@ class AgentConfig:
     # Networks.
     ensemble_size: int = 2  # N
     hidden: tuple[int, ...] = (256, 256)
+    networks: str = "mlp"  # mlp | sale: TD7's, with its critic loss and its hard target copies
     # Optimisation.
     lr: float = 3e-4
     gamma: float = 0.99
@@ -42,14 +43,19 @@ class AgentConfig:
     exploration_noise: float = 0.1
     target_noise: float = 0.2
     target_noise_clip: float = 0.5
-    # SAC's temperature.
+    sampled_actor: bool = False  # a Gaussian actor whose samples its update uses: the authors' released code
+    # SAC's entropy.
     temperature: float = 0.2
     learn_temperature: bool = False
-    # TD7's.
+    squashed_log_prob: bool = True  # of the action; else of the Gaussian, averaged over dims: the released code
+    # With SALE networks.
     embedding_size: int = 256  # Z of zs and zsa
+    train_encoder: bool = True
+    value_clipping: bool = True  # the reduced value stays within the targets seen so far
     target_update_period: int = 250  # updates between hard copies
+    min_priority: float = 1.0  # where the critics' Huber loss becomes linear, and the smallest |TD error| of LAP
+    # TD7's replay and policy checkpoints.
     priority_exponent: float = 0.4
-    min_priority: float = 1.0
     checkpoint_switch: int = 750_000  # gradient steps after which an assessment takes `assessment_episodes`
     assessment_episodes: int = 20
     checkpoint_reset_weight: float = 0.9  # what the best minimum return is multiplied with at the switch
@@ -58,16 +64,9 @@ class AgentConfig:
         return Scalars(**{name: getattr(self, name) for name in Scalars._fields})
 
 
-# The settings that TD7 alone has.
-TD7_SETTINGS = (
-    "embedding_size",
-    "target_update_period",
-    "priority_exponent",
-    "min_priority",
-    "checkpoint_switch",
-    "assessment_episodes",
-    "checkpoint_reset_weight",
-)
+# The settings that SALE networks have, and those that TD7 has besides.
+SALE_SETTINGS = ("embedding_size", "train_encoder", "value_clipping", "target_update_period", "min_priority")
+TD7_SETTINGS = ("priority_exponent", "checkpoint_switch", "assessment_episodes", "checkpoint_reset_weight")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,9 +108,17 @@ CHOICES = {
     "penalty": ("none", "batch_std", "transition_std"),
     "reduce": ("min", "mean", "subset_min"),
     "actor_reduce": ("mean", "min", "first"),
+    "networks": ("mlp", "sale"),
 }
 
-SWITCHES = ("penalty_inside_gamma", "learn_temperature")
+SWITCHES = (
+    "penalty_inside_gamma",
+    "sampled_actor",
+    "learn_temperature",
+    "squashed_log_prob",
+    "train_encoder",
+    "value_clipping",
+)
 
 # Limits of numbers, as (lowest, highest, what the setting takes).
 LIMITS: dict[str, tuple[float, float, str]] = {

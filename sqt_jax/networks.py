@@ -69,16 +69,23 @@ class Gaussian(NamedTuple):
     def mode(self) -> Array:
         return jnp.tanh(self.mean)
 
-    def sample(self, eps: Array) -> tuple[Array, Array]:
+    def sample(self, eps: Array, squashed_log_prob: bool = True) -> tuple[Array, Array]:
         """Action [B, A] and its log-probability [B] for the standard-normal draw `eps [B, A]`.
 
         The tanh correction log(1 - tanh(u)²) is written 2 (log 2 - u - softplus(-2u)), which does not underflow
-        (SAC, https://arxiv.org/abs/1801.01290, appendix C).
+        (SAC, https://arxiv.org/abs/1801.01290, appendix C). Without `squashed_log_prob` the log-probability is the
+        Gaussian's, before tanh, and averaged over the action's dimensions: what the authors of SQT released.
         """
         u = self.mean + jnp.exp(self.log_std) * eps
         log_prob = -0.5 * eps**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
+        if not squashed_log_prob:
+            return jnp.tanh(u), jnp.mean(log_prob, axis=-1)
         correction = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
         return jnp.tanh(u), jnp.sum(log_prob - correction, axis=-1)
+
+
+def clip_log_std(log_std: Array) -> Array:
+    return jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
 
 
 class GaussianActor(nn.Module):
@@ -92,7 +99,7 @@ class GaussianActor(nn.Module):
         x = hidden_layers(obs, self.hidden)
         mean = Dense(self.action_size, name="mean")(x)
         log_std = Dense(self.action_size, name="log_std")(x)
-        return Gaussian(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+        return Gaussian(mean, clip_log_std(log_std))
 
 
 class Critic(nn.Module):
@@ -122,14 +129,9 @@ def ensemble_of(module: type[nn.Module], ensemble_size: int) -> Callable[..., nn
     )
 
 
-def tanh_actor(action_size: int, hidden: Sequence[int]) -> Network:
-    """obs [B, O] -> action [B, A] in (-1, 1)"""
-    return network(TanhActor(action_size, hidden))
-
-
-def gaussian_actor(action_size: int, hidden: Sequence[int]) -> Network:
-    """obs [B, O] -> `Gaussian` of [B, A]"""
-    return network(GaussianActor(action_size, hidden))
+def actor(action_size: int, hidden: Sequence[int], gaussian: bool) -> Network:
+    """obs [B, O] -> action [B, A] in (-1, 1), or a `Gaussian` of [B, A]"""
+    return network((GaussianActor if gaussian else TanhActor)(action_size, hidden))
 
 
 def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> Network:

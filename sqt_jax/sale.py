@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 
-from sqt_jax.networks import Dense, Network, ensemble_of, network
+from sqt_jax.networks import Dense, Gaussian, Network, clip_log_std, ensemble_of, network
 from sqt_jax.types import Array, Params
 
 
@@ -49,18 +49,22 @@ class Encoder(nn.Module):
 
 
 class SaleActor(nn.Module):
-    """obs [B, O], zs [B, Z] -> action [B, A] in (-1, 1); ReLU."""
+    """obs [B, O], zs [B, Z] -> action [B, A] in (-1, 1), or the `Gaussian` before tanh; ReLU."""
 
     action_size: int
     hidden: Sequence[int]
+    gaussian: bool = False
 
     @nn.compact
-    def __call__(self, obs: Array, zs: Array) -> Array:
+    def __call__(self, obs: Array, zs: Array) -> Array | Gaussian:
         x = avg_l1_norm(Dense(self.hidden[0], name="layer0")(obs))
         x = jnp.concatenate([x, zs], axis=-1)
         for i, width in enumerate(self.hidden, start=1):
             x = nn.relu(Dense(width, name=f"layer{i}")(x))
-        return jnp.tanh(Dense(self.action_size, name=f"layer{len(self.hidden) + 1}")(x))
+        mean = Dense(self.action_size, name=f"layer{len(self.hidden) + 1}")(x)
+        if not self.gaussian:
+            return jnp.tanh(mean)
+        return Gaussian(mean, clip_log_std(Dense(self.action_size, name="log_std")(x)))
 
 
 class SaleCritic(nn.Module):
@@ -92,8 +96,9 @@ def encoder(embedding_size: int, hidden: Sequence[int]) -> EncoderNetwork:
     )
 
 
-def sale_actor(action_size: int, hidden: Sequence[int]) -> Network:
-    return network(SaleActor(action_size, hidden))
+def sale_actor(action_size: int, hidden: Sequence[int], gaussian: bool = False) -> Network:
+    """obs [B, O], zs [B, Z] -> action [B, A] in (-1, 1), or a `Gaussian` of [B, A]"""
+    return network(SaleActor(action_size, hidden, gaussian))
 
 
 def sale_critics(ensemble_size: int, hidden: Sequence[int]) -> Network:

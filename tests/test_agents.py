@@ -300,14 +300,31 @@ def test_the_target_is_the_plain_target_less_the_penalty(algo):
     np.testing.assert_allclose(theirs - ours_outside, penalty, rtol=1e-3, atol=1e-6)
 
 
+def test_a_sampled_actor_acts_by_its_mode_and_learns_from_its_samples():
+    config, agent, update, act = subject("td3", sampled_actor=True)
+    net = networks.actor(A, config.hidden, gaussian=True)
+    state, batch = agent.init(KEY), make_batch(0)
+    mode = net.apply(state.actor, batch.obs).mode()
+    np.testing.assert_allclose(act(state, batch.obs, KEY, deterministic=True), mode, rtol=1e-5, atol=1e-6)
+    explored = act(state, batch.obs, KEY) - mode
+    assert 0 < np.abs(explored).max() < 6 * config.exploration_noise
+    noise = agent.draw_noise(KEY, batch)
+    assert noise.action_eps.shape == (B, A)
+    state = state._replace(gradient_steps=jnp.int32(1))  # the actor's turn
+    with_noise = quick_jit(agent.update_with_noise)
+    one, other = (with_noise(state, batch, noise._replace(action_eps=noise.action_eps * c))[0] for c in (1, -1))
+    assert same(one.critic, other.critic) and not same(one.actor, other.actor)
+    assert subject("td3").agent.draw_noise(KEY, batch).action_eps is None
+
+
 # Clocks
 
 
 def target_period(algo):
     """Updates between two moves of the target networks."""
     config = subject(algo).config
-    periods = {td3.make: config.policy_delay, sac.make: 1, td7.make: config.target_update_period}
-    return periods[ALGORITHMS[algo].make_agent]
+    periods = {td3.TD3State: config.policy_delay, sac.SACState: 1, td7.TD7State: config.target_update_period}
+    return periods[type(start(algo))]
 
 
 @every_plain

@@ -12,12 +12,14 @@ from sqt_jax.algorithms import (
     ALGORITHMS,
     TRAIN_SETTINGS,
     agent_of,
+    make_agent,
     make_config,
     make_train,
     make_trainer,
     replay_of,
 )
 from sqt_jax.config import ConfigError
+from sqt_jax.types import Transition
 
 VARIANTS = {"": ("none", 0.0), "_sqt": ("batch_std", 0.5), "_sqt_tuple": ("transition_std", 0.1)}
 PAPERS_NINE = {"td3": td3, "sac": sac, "td7": td7}  # each with all variants
@@ -25,6 +27,7 @@ EARLIER = {"maxmin": td3, "redq": sac}  # with and without _sqt
 NAMES = {base + suffix: module for base, module in PAPERS_NINE.items() for suffix in VARIANTS} | {
     base + suffix: module for base, module in EARLIER.items() for suffix in ("", "_sqt")
 }
+STATES = {td3: td3.TD3State, sac: sac.SACState, td7: td7.TD7State}
 TD7 = [name for name, module in NAMES.items() if module is td7]
 
 
@@ -39,7 +42,8 @@ def test_the_table_has_these_names():
 @pytest.mark.parametrize("algo", NAMES)
 def test_each_name_is_its_bases_agent_with_its_variants_penalty(algo):
     agent = make_config(algo, "ant").agent
-    assert ALGORITHMS[algo].make_agent is NAMES[algo].make
+    state = jax.eval_shape(make_agent(algo, 3, 2).init, jax.random.key(0))
+    assert isinstance(state, STATES[NAMES[algo]])
     assert (agent.penalty, agent.penalty_coef) == VARIANTS[algo.removeprefix(base_of(algo))]
 
 
@@ -47,7 +51,7 @@ def test_each_name_is_its_bases_agent_with_its_variants_penalty(algo):
 def test_a_variant_differs_from_its_base_by_the_penalty_alone(algo):
     ours, plain = make_config(algo, "ant").flat(), make_config(base_of(algo), "ant").flat()
     assert {name for name in ours if ours[name] != plain[name]} == {"algo", "penalty", "penalty_coef"}
-    fields = ("make_agent", "training", "ignores", "prioritised", "single_env")
+    fields = ("make_agent", "training", "ignores", "assessed")
     row, base_row = ALGORITHMS[algo], ALGORITHMS[base_of(algo)]
     assert all(getattr(row, field) == getattr(base_row, field) for field in fields)
 
@@ -63,6 +67,28 @@ def test_the_earlier_ensembles_are_settings_of_td3_and_sac(algo, base, differenc
     ours, theirs = make_config(algo, "ant").flat(), make_config(base, "ant").flat()
     assert {name: ours[name] for name in ours if ours[name] != theirs[name]} == {"algo": algo} | differences
     assert ours["subset_size"] == 2
+
+
+@pytest.mark.parametrize("algo", [name for name in NAMES if name not in TD7])
+def test_sale_networks_make_the_same_actions_in_td7s_update_without_its_checkpoints(algo):
+    settings = {"networks": "sale", "hidden": (5, 4), "embedding_size": 6}
+    agent = make_agent(algo, 3, 2, **settings)
+    state = jax.eval_shape(agent.init, jax.random.key(0))
+    assert isinstance(state, td7.TD7State) and state.checkpoints is None
+    assert ("log_std" in state.actor["params"]) == (NAMES[algo] is sac)
+    batch = Transition(*(jnp.zeros(shape) for shape in ((4, 3), (4, 2), (4,), (4, 3), (4,))))
+    noise, plain_noise = (
+        jax.eval_shape(make_agent(algo, 3, 2, **changes).draw_noise, jax.random.key(0), batch)
+        for changes in (settings, {})
+    )
+    assert noise == plain_noise
+
+
+@pytest.mark.parametrize("algo", TD7)
+def test_td7_has_its_own_networks(algo):
+    assert make_config(algo, "ant").agent.networks == "sale"
+    with pytest.raises(ConfigError, match=f"--networks: takes sale for {algo}$"):
+        make_config(algo, "ant", networks="mlp")
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

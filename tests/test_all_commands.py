@@ -8,15 +8,26 @@ from experiments.run import main
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.envs import TASKS
 
+TINY = ["--steps=300", "--warmup_steps=290", "--eval_every=300", "--eval_episodes=1", "--name=tiny", "--quiet"]
+
+
+def starts(algo, env, out, *more):
+    assert main(["run", f"--algo={algo}", f"--env={env}", f"--out={out}", *TINY, *more]) == 0
+    path = out / env / algo / "tiny"
+    with (path / "evaluations.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["env_steps"] for row in rows] == ["0"] * 5 + ["300"] * 5
+    assert all(row["return_mean"] for row in rows) and (path / "policy" / "member_4.npz").exists()
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env", TASKS)
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_algorithm_starts_on_every_task(algo, env, tmp_path):
-    argv = ["run", f"--algo={algo}", f"--env={env}", "--steps=300", "--warmup_steps=290", "--eval_every=300"]
-    assert main([*argv, "--eval_episodes=1", f"--out={tmp_path}", "--name=tiny", "--quiet"]) == 0
-    path = tmp_path / env / algo / "tiny"
-    with (path / "evaluations.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["env_steps"] for row in rows] == ["0"] * 5 + ["300"] * 5
-    assert all(row["return_mean"] for row in rows) and (path / "policy" / "member_4.npz").exists()
+    starts(algo, env, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))])
+def test_the_released_preset_starts(algo, tmp_path):
+    starts(algo, "cheetah", tmp_path, "--preset=released")

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sqt_jax.algorithms import ALGORITHMS, make_config
-from sqt_jax.config import CHOICES, LIMITS, AgentConfig, ConfigError, TrainConfig
+from sqt_jax.config import CHOICES, LIMITS, SWITCHES, AgentConfig, ConfigError, TrainConfig
 from sqt_jax.types import Scalars
 
 
@@ -63,6 +63,11 @@ REFUSED = [
     ("ensemble_size", {"ensemble_size": 1001}),
     ("subset_size", {"subset_size": 0}),
     ("subset_size", {"reduce": "subset_min", "subset_size": 3}),
+    ("networks", {"networks": "cnn"}),
+    ("sampled_actor", {"sampled_actor": 1}),
+    ("squashed_log_prob", {"squashed_log_prob": "no"}),
+    ("train_encoder", {"train_encoder": 0}),
+    ("value_clipping", {"value_clipping": None}),
     ("hidden", {"hidden": ()}),
     ("hidden", {"hidden": (256, 0)}),
     ("hidden", {"hidden": (256, 70_000)}),
@@ -123,7 +128,7 @@ def test_what_cannot_be_is_refused_by_its_name(setting, settings):
 
 
 def test_every_limited_setting_is_among_the_refused():
-    assert set(LIMITS) | set(CHOICES) <= {setting for setting, _ in REFUSED}
+    assert set(LIMITS) | set(CHOICES) | set(SWITCHES) <= {setting for setting, _ in REFUSED}
 
 
 @pytest.mark.parametrize(
@@ -163,9 +168,10 @@ def test_a_plain_algorithm_may_have_one_critic():
     ("algo", "settings"),
     [
         ("td3", {"temperature": 0.1}),
-        ("td3_sqt", {"target_update_period": 100}),
+        ("td3_sqt", {"priority_exponent": 0.5}),
         ("sac", {"exploration_noise": 0.2}),
-        ("redq_sqt", {"min_priority": 2.0}),
+        ("sac_sqt", {"sampled_actor": True}),
+        ("td3", {"squashed_log_prob": False}),
         ("td7", {"tau": 0.01}),
         ("td7_sqt", {"temperature": 0.1}),
     ],
@@ -175,6 +181,26 @@ def test_a_setting_without_effect_is_refused_and_its_default_is_taken(algo, sett
     with pytest.raises(ConfigError, match=f"--{name}: has no effect with {algo}$"):
         make_config(algo, "ant", **settings)
     assert make_config(algo, "ant", **{name: getattr(AgentConfig, name)}) == make_config(algo, "ant")
+
+
+@pytest.mark.parametrize(
+    ("networks", "settings"),
+    [
+        ("mlp", {"target_update_period": 100}),
+        ("mlp", {"min_priority": 2.0}),
+        ("mlp", {"train_encoder": False}),
+        ("sale", {"tau": 0.01}),
+    ],
+)
+def test_a_setting_without_effect_on_these_networks_is_refused(networks, settings):
+    (name,) = settings
+    with pytest.raises(ConfigError, match=f"--{name}: has no effect with --networks={networks}$"):
+        make_config("sac_sqt", "ant", networks=networks, **settings)
+
+
+def test_the_temperature_is_fixed_with_sale_networks():
+    with pytest.raises(ConfigError, match="--temperature: has no effect with --networks=sale$"):
+        make_config("sac", "ant", networks="sale", learn_temperature=True)
 
 
 def test_a_learned_temperature_is_refused_by_the_flags_name():

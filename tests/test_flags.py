@@ -78,7 +78,7 @@ BAD = {
     "--seeds=-1": "--seeds=-1: takes whole numbers from 0 to 4294967295",
     "--seeds=4294967296": "--seeds=4294967296: takes whole numbers from 0 to 4294967295",
     "--seeds=0.5": "--seeds=0.5: takes whole numbers like 0,1,2",
-    "--preset=fast": "--preset=fast: takes one of paper, quick",
+    "--preset=fast": "--preset=fast: takes one of paper, quick, released",
     "--name=a/b": "--name=a/b: takes up to 200 bytes, no slashes or control characters: it names a folder",
     "--name=..": "--name=..: takes up to 200 bytes, no slashes or control characters: it names a folder",
     "--name=": "--name=: takes up to 200 bytes, no slashes or control characters: it names a folder",
@@ -139,8 +139,9 @@ def test_every_algorithm_is_named_in_the_help():
         assert re.search(rf"\b{algo.split('_sqt')[0]}\b", text)
 
 
-def test_td7s_settings_have_a_group_of_their_own():
-    assert [flag.name for flag in flags.FLAGS["TD7"]] == list(flags.TD7_SETTINGS)
+def test_td7s_settings_have_groups_of_their_own():
+    assert {flag.name for flag in flags.FLAGS["TD7"]} == set(flags.TD7_SETTINGS)
+    assert {flag.name for flag in flags.FLAGS["SALE networks (TD7; --networks=sale)"]} == set(flags.SALE_SETTINGS)
     names = [flag.name for group in flags.FLAGS.values() for flag in group]
     assert len(names) == len(set(names))
     assert parse("--target_update_period=100", "--priority_exponent=0.5", "--checkpoint_switch=1e5").settings == {

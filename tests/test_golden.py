@@ -11,16 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.presets import preset_settings
 from sqt_jax import lap
 from sqt_jax.agents import sac, td3, td7
+from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS
 from sqt_jax.config import AgentConfig
 from sqt_jax.types import Transition
 
-FOLDER = Path(os.environ.get("SQT_GOLDEN_DIR", Path(__file__).parent / "data" / "golden"))
-FILES = sorted(path for path in FOLDER.glob("*.npz") if path.name.startswith(("td3_", "sac_", "td7_")))
+DATA = Path(__file__).parent / "data" / "golden"
+FOLDER = Path(os.environ.get("SQT_GOLDEN_DIR", DATA))
+FILES = sorted(FOLDER.glob("*.npz"))
 TOLERANCE = {"rtol": 1e-5, "atol": 3e-6}
-MODULES = {"td3": td3, "sac": sac, "td7": td7}
-PENALTY = {"plain": "none", "sqt": "batch_std", "sqt_tuple": "transition_std"}
 
 
 def tree(arrays: dict, prefix: str) -> dict:
@@ -35,38 +36,45 @@ def tree(arrays: dict, prefix: str) -> dict:
     return out
 
 
-def build(arrays: dict, algo: str, variant: str, **changes):
-    """The agent that a file describes, its state before the first update, and its batches [K, B, ...]."""
+def build(arrays: dict, name: str, **changes):
+    """The agent that a file describes, its state before the first update, and its batches [K, B, ...].
+
+    `name` is the file's: `[released_]<algorithm>_<plain, sqt or sqt_tuple>`.
+    """
     batch = tree(arrays, "batch")
     nets = tree(arrays, "init")
-    kernels = [nets["critic"][layer]["kernel"] for layer in sorted(nets["critic"])]
     meta = {key[len("meta/") :]: arrays[key].item() for key in arrays if key.startswith("meta/")}
-    for name in {"policy_delay", "target_update_period"} & meta.keys():
-        meta[name] = int(meta[name])
-    settings = {"penalty": PENALTY[variant], "ensemble_size": kernels[0].shape[0]} | meta | changes
-    if algo == "td7":
+    for key in {"policy_delay", "target_update_period"} & meta.keys():
+        meta[key] = int(meta[key])
+    algo = name.removeprefix("released_").removesuffix("_plain")
+    row = ALGORITHMS[algo]
+    preset = preset_settings("released", algo, "ant") if name.startswith("released_") else {}
+    settings = row.settings | {key: preset[key] for key in AGENT_SETTINGS & preset.keys()} | meta | changes
+    kernels = [nets["critic"][layer]["kernel"] for layer in sorted(nets["critic"])]
+    settings["ensemble_size"] = kernels[0].shape[0]
+    if "encoder" in nets:
         settings["embedding_size"] = nets["encoder"]["state2"]["bias"].shape[0]
         kernels = kernels[1:]  # layer0 lies before the embeddings
     config = AgentConfig(hidden=tuple(k.shape[-1] for k in kernels[:-1]), **settings)
-    module = MODULES[algo]
-    agent = module.make(config, batch["obs"].shape[-1], batch["action"].shape[-1])
+    agent = row.make_agent(config, batch["obs"].shape[-1], batch["action"].shape[-1])
     state = agent.init(jax.random.key(0))
-    if "value_bounds" in nets:
-        state = state._replace(value_bounds=td7.ValueBounds(*nets.pop("value_bounds")))
+    bounds = nets.pop("value_bounds", None)
+    if config.value_clipping and bounds is not None:
+        state = state._replace(value_bounds=td7.ValueBounds(*bounds))
     state = state._replace(**{name: {"params": params} for name, params in nets.items()})
     return agent, config, state, batch
 
 
 def noise_of(algo: str, batch: dict, k: int, config: AgentConfig):
     subset = jnp.arange(config.ensemble_size)
-    if algo != "sac":
-        return td3.TD3Noise(batch["target_noise"][k], subset)
-    return sac.SACNoise(batch["next_action_eps"][k], batch["action_eps"][k], subset)
+    if algo.startswith("sac"):
+        return sac.SACNoise(batch["next_action_eps"][k], batch["action_eps"][k], subset)
+    return td3.TD3Noise(batch["target_noise"][k], subset, batch["action_eps"][k] if config.sampled_actor else None)
 
 
-def replay_trace(arrays: dict, algo: str, variant: str, **changes):
+def replay_trace(arrays: dict, name: str, **changes):
     """The largest deviation from the trace, in units of the tolerance (1 is the limit), by name."""
-    agent, config, state, batch = build(arrays, algo, variant, **changes)
+    agent, config, state, batch = build(arrays, name, **changes)
     update = jax.jit(agent.update_with_noise)
     deviation: dict[str, float] = {}
 
@@ -77,34 +85,55 @@ def replay_trace(arrays: dict, algo: str, variant: str, **changes):
 
     for k in range(batch["obs"].shape[0]):
         transition = Transition(*(batch[field][k] for field in Transition._fields))
-        noise = noise_of(algo, batch, k, config)
+        noise = noise_of(name.removeprefix("released_"), batch, k, config)
         target, ours = agent.td_target(state, transition, noise)
         state, td_error, _ = update(state, transition, noise)
         ours |= {"td_target": target, "priority": lap.priority(td_error, config.priority_exponent, config.min_priority)}
-        for name in [key for key in arrays if key.startswith("trace/")]:
-            compare(name, ours[name.split("/")[1]], arrays[name][k])
-    for name, params in tree(arrays, "final").items():
-        if name == "value_bounds":
-            compare(name, jnp.stack(state.value_bounds), params)
-            continue
-        ours = getattr(state, name)["params"]
-        jax.tree.map(lambda a, b, name=name: compare("final/" + name, a, b), ours, params)
+        for key in [key for key in arrays if key.startswith("trace/")]:
+            compare(key, ours[key.split("/")[1]], arrays[key][k])
+    for net, params in tree(arrays, "final").items():
+        if net == "value_bounds":
+            ours = jnp.stack(state.value_bounds) if state.value_bounds else arrays["init/value_bounds"]  # unused
+            compare(net, ours, params)
+        else:
+            ours = getattr(state, net)["params"]
+            jax.tree.map(lambda a, b, net=net: compare("final/" + net, a, b), ours, params)
     return deviation
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_update_agrees_with_the_trace(path):
-    deviation = replay_trace(dict(np.load(path)), *path.stem.split("_", 1))
+    deviation = replay_trace(dict(np.load(path)), path.stem)
     assert "trace/td_target" in deviation and "final/critic" in deviation
     assert not {name: excess for name, excess in deviation.items() if not excess <= 1}
 
 
-@pytest.mark.parametrize("algo", MODULES)
-@pytest.mark.parametrize(
-    "fault",
-    [{"penalty_coef": 0.0}, {"ddof": 0}, {"actor_reduce": "min"}, {"reduce": "mean"}, {"penalty_inside_gamma": False}],
-    ids=str,
-)
-def test_the_traces_notice_a_wrong_formula(algo, fault):
-    arrays = dict(np.load(FOLDER / f"{algo}_sqt.npz"))
-    assert max(replay_trace(arrays, algo, "sqt", **fault).values()) > 30
+def test_there_is_a_trace_of_each_of_the_nine_and_of_the_released_code():
+    names = {path.stem for path in DATA.glob("*.npz")}
+    bases = ("td3", "sac", "td7")
+    nine = {f"{base}_{variant}" for base in bases for variant in ("plain", "sqt", "sqt_tuple")}
+    assert names == nine | {f"released_{base}_sqt" for base in bases}
+
+
+FORMULA = [
+    {"penalty_coef": 0.0},
+    {"ddof": 0},
+    {"actor_reduce": "min"},
+    {"reduce": "mean"},
+    {"penalty_inside_gamma": False},
+]
+RELEASED = {
+    "released_td3_sqt": [{"sampled_actor": False}, {"train_encoder": True}, {"value_clipping": True}],
+    "released_sac_sqt": [{"squashed_log_prob": True}, {"train_encoder": True}, {"policy_delay": 1}],
+    "released_td7_sqt": [{"sampled_actor": False}, {"train_encoder": False}, {"value_clipping": False}],
+}
+FAULTS = [(f"{algo}_sqt", fault) for algo in ("td3", "sac", "td7") for fault in FORMULA]
+FAULTS += [(name, fault) for name, faults in RELEASED.items() for fault in faults]
+
+
+@pytest.mark.parametrize(("name", "fault"), FAULTS, ids=str)
+def test_the_traces_notice_a_wrong_formula(name, fault):
+    arrays = dict(np.load(DATA / f"{name}.npz"))
+    if fault == {"sampled_actor": False}:  # the deterministic actor has no such head
+        arrays = {key: value for key, value in arrays.items() if "/log_std/" not in key}
+    assert max(replay_trace(arrays, name, **fault).values()) > 30

@@ -131,6 +131,15 @@ def test_log_prob_is_the_change_of_variables(maybe_jit):
     np.testing.assert_allclose(log_prob, expected, rtol=1e-5, atol=1e-5)
 
 
+def test_unsquashed_log_prob_is_the_gaussians_own_averaged_over_dims(maybe_jit):
+    gaussian = networks.Gaussian(MEAN, LOG_STD)
+    action, log_prob = maybe_jit(lambda eps: gaussian.sample(eps, squashed_log_prob=False))(EPS)
+    np.testing.assert_array_equal(action, maybe_jit(lambda eps: gaussian.sample(eps)[0])(EPS))
+    mean, std = np.asarray(MEAN, np.float64), np.exp(np.asarray(LOG_STD, np.float64))
+    expected = stats.norm.logpdf(mean + std * np.asarray(EPS, np.float64), mean, std).mean(axis=-1)
+    np.testing.assert_allclose(log_prob, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_the_density_of_actions_integrates_to_one():
     mean, log_std = 0.5, -0.5
 

@@ -157,6 +157,16 @@ def test_each_critic_sees_zsa_before_zs_beside_the_normed_input(maybe_jit, param
         np.testing.assert_allclose(q[i], dense(own, "layer3", x)[:, 0], rtol=1e-4, atol=1e-5)
 
 
+def test_the_gaussian_actor_is_the_same_with_a_head_of_log_stds(params):
+    net = sale.sale_actor(A, HIDDEN, gaussian=True)
+    shape = jax.eval_shape(net.init, KEY, OBS, ZS)["params"]
+    assert shapes(shape["log_std"]) == layer(6, A)
+    head = {"kernel": jnp.zeros((6, A)), "bias": jnp.array([1.5, 99.0])}
+    gaussian = net.apply({"params": params[1]["params"] | {"log_std": head}}, OBS, ZS)
+    np.testing.assert_allclose(gaussian.mode(), ACTOR.apply(params[1], OBS, ZS), rtol=1e-6)
+    np.testing.assert_array_equal(gaussian.log_std, np.broadcast_to([1.5, 2.0], (B, A)))
+
+
 def test_actions_stay_within_their_limits(params):
     action = ACTOR.apply(params[1], 1e6 * OBS, 1e6 * ZS)
     assert np.all(np.isfinite(action)) and np.abs(action).max() <= 1

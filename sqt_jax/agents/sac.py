@@ -8,6 +8,7 @@ import optax
 
 from sqt_jax import losses, networks
 from sqt_jax.agents import critic as critics
+from sqt_jax.agents.actions import Actions
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step, soft_update
 from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
@@ -31,8 +32,36 @@ class SACNoise(NamedTuple):
     subset: Array  # [M]: critics of the target
 
 
+def actions(config: AgentConfig) -> Actions:
+    """SAC's way of acting: samples of a Gaussian squashed by tanh."""
+
+    def greedy(output: networks.Gaussian) -> Array:
+        return output.mode()
+
+    def explore(output: networks.Gaussian, key: Array) -> Array:
+        return output.sample(jax.random.normal(key, output.mean.shape))[0]
+
+    def draw_noise(key: Array, batch: Transition) -> SACNoise:
+        next_key, own_key, subset_key = jax.random.split(key, 3)
+        shape = batch.action.shape
+        return SACNoise(
+            next_action_eps=jax.random.normal(next_key, shape),
+            action_eps=jax.random.normal(own_key, shape),
+            subset=critics.draw_subset(subset_key, config),
+        )
+
+    def next_action(output: networks.Gaussian, noise: SACNoise) -> tuple[Array, Array]:
+        return output.sample(noise.next_action_eps, config.squashed_log_prob)
+
+    def own_action(output: networks.Gaussian, noise: SACNoise) -> tuple[Array, Array]:
+        return output.sample(noise.action_eps, config.squashed_log_prob)
+
+    return Actions(True, True, greedy, explore, draw_noise, next_action, own_action)
+
+
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
-    actor_net = networks.gaussian_actor(action_size, config.hidden)
+    acting = actions(config)
+    actor_net = networks.actor(action_size, config.hidden, acting.gaussian)
     critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
     target_entropy = -float(action_size)
 
@@ -59,28 +88,18 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         return state.actor
 
     def policy_action(actor: Params, obs: Array) -> Array:
-        return actor_net.apply(actor, obs).mode()
+        return acting.greedy(actor_net.apply(actor, obs))
 
     def act(state: SACState, obs: Array, key: Array, deterministic: bool = False) -> Array:
         if deterministic:
             return policy_action(policy(state), obs)
-        gaussian = actor_net.apply(state.actor, obs)
-        return gaussian.sample(jax.random.normal(key, gaussian.mean.shape))[0]
-
-    def draw_noise(key: Array, batch: Transition) -> SACNoise:
-        next_key, own_key, subset_key = jax.random.split(key, 3)
-        shape = batch.action.shape
-        return SACNoise(
-            next_action_eps=jax.random.normal(next_key, shape),
-            action_eps=jax.random.normal(own_key, shape),
-            subset=critics.draw_subset(subset_key, config),
-        )
+        return acting.explore(actor_net.apply(state.actor, obs), key)
 
     def temperature(state: SACState) -> Array | float:
         return jnp.exp(state.log_temperature) if config.learn_temperature else state.scalars.temperature
 
     def td_target(state: SACState, batch: Transition, noise: SACNoise) -> tuple[Array, dict[str, Array]]:
-        next_action, next_log_prob = actor_net.apply(state.actor, batch.next_obs).sample(noise.next_action_eps)
+        next_action, next_log_prob = acting.next_action(actor_net.apply(state.actor, batch.next_obs), noise)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         entropy_term = temperature(state) * next_log_prob
         target, terms = critics.td_target(config, state.scalars, batch, next_q, noise.subset, entropy_term)
@@ -99,7 +118,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
 
     def update_actor(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Metrics]:
         def loss_fn(actor):
-            action, log_prob = actor_net.apply(actor, batch.obs).sample(noise.action_eps)
+            action, log_prob = acting.own_action(actor_net.apply(actor, batch.obs), noise)
             q = critic_net.apply(state.critic, batch.obs, action)
             return jnp.mean(temperature(state) * log_prob - losses.actor_value(q, config.actor_reduce)), log_prob
 
@@ -128,6 +147,6 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         return state, td_error, metrics | actor_metrics
 
     def update(state: SACState, batch: Transition, key: Array) -> tuple[SACState, Array, Metrics]:
-        return update_with_noise(state, batch, draw_noise(key, batch))
+        return update_with_noise(state, batch, acting.draw_noise(key, batch))
 
-    return Agent(init, act, update, draw_noise, update_with_noise, td_target, policy, policy_action)
+    return Agent(init, act, update, acting.draw_noise, update_with_noise, td_target, policy, policy_action)

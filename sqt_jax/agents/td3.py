@@ -1,6 +1,5 @@
 """TD3 (https://arxiv.org/abs/1802.09477) with N critics and the variant's target."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ import optax
 
 from sqt_jax import losses, networks
 from sqt_jax.agents import critic as critics
+from sqt_jax.agents.actions import Actions, Output
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step, soft_update
 from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
@@ -28,15 +28,7 @@ class TD3State(NamedTuple):
 class TD3Noise(NamedTuple):
     target_noise: Array  # [B, A], scaled, not yet clipped
     subset: Array  # [M]: critics of the target
-
-
-def make_draw_noise(config: AgentConfig) -> Callable[[Array, Transition], TD3Noise]:
-    def draw_noise(key: Array, batch: Transition) -> TD3Noise:
-        noise_key, subset_key = jax.random.split(key)
-        noise = config.target_noise * jax.random.normal(noise_key, batch.action.shape)
-        return TD3Noise(noise, critics.draw_subset(subset_key, config))
-
-    return draw_noise
+    action_eps: Array | None = None  # [B, A] standard normal: the actor's own action, with `sampled_actor` alone
 
 
 def smooth(action: Array, noise: Array, config: AgentConfig) -> Array:
@@ -45,10 +37,43 @@ def smooth(action: Array, noise: Array, config: AgentConfig) -> Array:
     return jnp.clip(action + clipped, -1.0, 1.0)
 
 
+def actions(config: AgentConfig) -> Actions:
+    """TD3's way of acting: deterministic, with noise to explore and smoothed in the target.
+
+    With `sampled_actor` the actor is a Gaussian, whose mode acts and which is updated by its samples: what the authors
+    of SQT released.
+    """
+
+    def greedy(output: Output) -> Array:
+        return output.mode() if config.sampled_actor else output
+
+    def explore(output: Output, key: Array) -> Array:
+        action = greedy(output)
+        noise = config.exploration_noise * jax.random.normal(key, action.shape)
+        return jnp.clip(action + noise, -1.0, 1.0)
+
+    def draw_noise(key: Array, batch: Transition) -> TD3Noise:
+        noise_key, subset_key, own_key = jax.random.split(key, 3)
+        shape = batch.action.shape
+        return TD3Noise(
+            target_noise=config.target_noise * jax.random.normal(noise_key, shape),
+            subset=critics.draw_subset(subset_key, config),
+            action_eps=jax.random.normal(own_key, shape) if config.sampled_actor else None,
+        )
+
+    def next_action(output: Output, noise: TD3Noise) -> tuple[Array, Array]:
+        return smooth(greedy(output), noise.target_noise, config), jnp.zeros(())
+
+    def own_action(output: Output, noise: TD3Noise) -> tuple[Array, Array]:
+        return output.sample(noise.action_eps)[0] if config.sampled_actor else output, jnp.zeros(())
+
+    return Actions(config.sampled_actor, False, greedy, explore, draw_noise, next_action, own_action)
+
+
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
-    actor_net = networks.tanh_actor(action_size, config.hidden)
+    acting = actions(config)
+    actor_net = networks.actor(action_size, config.hidden, acting.gaussian)
     critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
-    draw_noise = make_draw_noise(config)
 
     def init(key: Array, scalars: Scalars | None = None) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
@@ -70,17 +95,15 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         return state.actor
 
     def policy_action(actor: Params, obs: Array) -> Array:
-        return actor_net.apply(actor, obs)
+        return acting.greedy(actor_net.apply(actor, obs))
 
     def act(state: TD3State, obs: Array, key: Array, deterministic: bool = False) -> Array:
-        action = policy_action(policy(state), obs)
         if deterministic:
-            return action
-        noise = config.exploration_noise * jax.random.normal(key, action.shape)
-        return jnp.clip(action + noise, -1.0, 1.0)
+            return policy_action(policy(state), obs)
+        return acting.explore(actor_net.apply(state.actor, obs), key)
 
     def td_target(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[Array, dict[str, Array]]:
-        next_action = smooth(actor_net.apply(state.target_actor, batch.next_obs), noise.target_noise, config)
+        next_action, _ = acting.next_action(actor_net.apply(state.target_actor, batch.next_obs), noise)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         return critics.td_target(config, state.scalars, batch, next_q, noise.subset)
 
@@ -95,9 +118,10 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             terms,
         )
 
-    def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
+    def update_actor(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array]:
         def loss_fn(actor):
-            q = critic_net.apply(state.critic, batch.obs, actor_net.apply(actor, batch.obs))
+            action, _ = acting.own_action(actor_net.apply(actor, batch.obs), noise)
+            q = critic_net.apply(state.critic, batch.obs, action)
             return -jnp.mean(losses.actor_value(q, config.actor_reduce))
 
         loss, grads = jax.value_and_grad(loss_fn)(state.actor)
@@ -116,7 +140,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         gradient_steps = state.gradient_steps + 1
 
         def delayed(state):
-            state, actor_loss = update_actor(state, batch)
+            state, actor_loss = update_actor(state, batch, noise)
             return update_targets(state), actor_loss
 
         def skip(state):
@@ -127,6 +151,6 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         return state._replace(gradient_steps=gradient_steps), td_error, metrics | {"actor_loss": actor_loss}
 
     def update(state: TD3State, batch: Transition, key: Array) -> tuple[TD3State, Array, Metrics]:
-        return update_with_noise(state, batch, draw_noise(key, batch))
+        return update_with_noise(state, batch, acting.draw_noise(key, batch))
 
-    return Agent(init, act, update, draw_noise, update_with_noise, td_target, policy, policy_action)
+    return Agent(init, act, update, acting.draw_noise, update_with_noise, td_target, policy, policy_action)

@@ -1,0 +1,98 @@
+"""TD7's policy checkpoints by hand: what an episode's end does to snapshot, checkpoint and counters."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sqt_jax.agents import assessment
+from sqt_jax.agents.td7 import Policy
+from sqt_jax.config import AgentConfig
+
+SWITCH = 4
+CONFIG = AgentConfig(checkpoint_switch=SWITCH, assessment_episodes=3)
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def labelled(label):
+    return Policy(jnp.float32(label), jnp.float32(label))
+
+
+def assess(state, learner, gradient_steps, episode_return, ended=True):
+    return jax.jit(assessment.assess, static_argnums=0)(
+        CONFIG, state, labelled(learner), jnp.int32(gradient_steps), jnp.float32(episode_return), jnp.asarray(ended)
+    )
+
+
+def story(state, *episodes, gradient_steps=0, learners=range(1, 100)):
+    """(snapshot, checkpoint, best, min, episodes, assessments, refreshes) after each of the episodes."""
+    rows = []
+    for learner, episode_return in zip(learners, episodes, strict=False):
+        state = assess(state, learner, gradient_steps, episode_return)
+        assert same(state.snapshot.actor, state.snapshot.encoder)
+        assert same(state.checkpoint.actor, state.checkpoint.encoder)
+        rows.append((float(state.snapshot.actor), float(state.checkpoint.actor), *map(float, state[2:])))
+    return state, rows
+
+
+START = assessment.Checkpoints(labelled(0), labelled(0), *map(jnp.float32, (-1e8, np.inf, 0, 0, 0)))
+
+
+def test_before_the_switch_each_episode_is_an_assessment():
+    _, rows = story(START, 5.0, 3.0, 7.0, 7.0, -2.0)
+    assert rows == [
+        # snapshot, checkpoint, best, min, episodes, assessments, refreshes
+        (1, 0, 5, np.inf, 0, 1, 1),  # the policy that was assessed is the checkpoint, not the learner of now
+        (2, 0, 5, np.inf, 0, 2, 1),  # worse: 1 is given up
+        (3, 2, 7, np.inf, 0, 3, 2),
+        (4, 3, 7, np.inf, 0, 4, 3),  # as good is good enough
+        (5, 3, 7, np.inf, 0, 5, 3),
+    ]
+
+
+def test_after_the_switch_an_assessment_takes_its_episodes_and_ends_early_below_the_best():
+    state = START._replace(snapshot=labelled(50), best_min_return=jnp.float32(6))
+    _, rows = story(state, 8.0, 9.0, 7.0, 9.0, 6.5, 7.0, 8.0, 7.5, gradient_steps=SWITCH)
+    assert rows == [
+        (50, 0, 6, 8, 1, 0, 0),
+        (50, 0, 6, 8, 2, 0, 0),  # the minimum, not the last
+        (3, 50, 7, np.inf, 0, 1, 1),
+        (3, 50, 7, 9, 1, 1, 1),
+        (5, 50, 7, np.inf, 0, 2, 1),  # below the best: over after two episodes
+        (5, 50, 7, 7, 1, 2, 1),
+        (5, 50, 7, 7, 2, 2, 1),
+        (8, 5, 7, np.inf, 0, 3, 2),
+    ]
+
+
+def test_the_switch_is_a_number_of_gradient_steps():
+    for gradient_steps, assessments in [(SWITCH - 1, 1), (SWITCH, 0), (SWITCH + 1, 0)]:
+        assert assess(START, 1, gradient_steps, 5.0).assessments == assessments
+
+
+def test_an_assessment_that_the_switch_finds_under_way_goes_on():
+    state = assess(START, 1, SWITCH, 5.0)
+    assert (state.episodes, state.assessments) == (1, 0)
+    _, rows = story(state, 6.0, 4.0, gradient_steps=SWITCH + 100, learners=[2, 3])
+    assert rows == [(0, 0, -1e8, 5, 2, 0, 0), (3, 0, 4, np.inf, 0, 1, 1)]
+
+
+@pytest.mark.parametrize("episode_return", [-1e9, 5.0, 1e9])
+def test_a_running_episode_changes_nothing(episode_return):
+    for gradient_steps in (0, SWITCH):
+        state, _ = story(START, 5.0, 6.0, gradient_steps=gradient_steps)
+        assert same(assess(state, 9, gradient_steps, episode_return, ended=False), state)
+
+
+def test_at_the_start_the_policy_is_all_there_is():
+    assert same(assessment.start(labelled(0)), START)
+
+
+@pytest.mark.parametrize(("best", "reset"), [(100.0, 90.0), (-100.0, -90.0)])
+def test_the_best_is_lowered_at_the_switch_alone(best, reset):
+    state = START._replace(best_min_return=jnp.float32(best))
+    lowered = [assessment.lower_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
+    np.testing.assert_allclose([float(state.best_min_return) for state in lowered], [best, reset, best], rtol=1e-6)
