@@ -8,22 +8,26 @@ import numpy as np
 import probe_envs
 import pytest
 
+from experiments.presets import preset_settings
 from sqt_jax import algorithms, policy
 from sqt_jax.algorithms import ALGORITHMS
 
 
-def saved(algo, directory, members=2):
+def saved(algo, directory, members=2, **settings):
     env = probe_envs.constant_reward()
-    config = algorithms.make_config(algo, "cheetah", hidden=(8, 8))
+    config = algorithms.make_config(algo, "cheetah", hidden=(8, 8), **settings)
     agent = algorithms.agent_of(config, env)
     state = jax.vmap(agent.init)(jax.random.split(jax.random.key(1), members))
     policy.save_policy(directory, config, env, state)
     return agent, state
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+RELEASED = {f"{algo} released": preset_settings("released", algo, "cheetah") for algo in ("td3", "sac", "td7")}
+
+
+@pytest.mark.parametrize("algo", [*ALGORITHMS, *RELEASED])
 def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
-    agent, state = saved(algo, tmp_path / "policy")
+    agent, state = saved(algo.split()[0], tmp_path / "policy", **RELEASED.get(algo, {}))
     obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
     for member in range(2):
         own = jax.tree.map(lambda leaf, member=member: leaf[member], state)
