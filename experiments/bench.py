@@ -190,6 +190,19 @@ def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
     return Row("loop", f"{algo} on {task}", members, "env steps", rate * members, compile_seconds)
 
 
+def check_flags() -> None:
+    """Leaves with one line that names the first flag with a value that cannot be."""
+    known = {"suites": SUITES, "tasks": envs.TASKS, "algos": algorithms.ALGORITHMS}
+    for name, values in known.items():
+        for value in getattr(FLAGS, name):
+            if value not in values:
+                sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
+    for name in ("members", "capacities"):
+        for value in getattr(FLAGS, name):
+            if not value.isdecimal() or int(value) < 1:
+                sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
+
+
 def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
     tasks, algos = FLAGS.tasks, FLAGS.algos
     members = [int(value) for value in FLAGS.members]
@@ -230,9 +243,7 @@ def markdown(all_rows: Sequence[Row]) -> str:
 
 def main(argv: Sequence[str]) -> None:
     del argv
-    unknown = [suite for suite in FLAGS.suites if suite not in SUITES]
-    if unknown:
-        sys.exit(f"--suites: takes some of {', '.join(SUITES)}, not {unknown[0]!r}")
+    check_flags()
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here

@@ -42,7 +42,14 @@ NEVER = {
     "sqt_jax.evaluate": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
 }
 # What an agent may take from others: TD7 is TD3's successor and smooths its target as TD3 does.
-AGENTS = {"critic": set(), "td3": {"critic"}, "sac": {"critic"}, "td7": {"critic", "td3"}}
+AGENTS = {
+    "actions": (),
+    "assessment": (),
+    "critic": (),
+    "td3": ("actions", "critic"),
+    "sac": ("actions", "critic"),
+    "td7": ("actions", "assessment", "critic", "td3"),
+}
 
 
 def modules(folder: str) -> dict[str, Path]:
