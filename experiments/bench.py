@@ -31,7 +31,7 @@ BATCH = 256
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
 flags.DEFINE_list("tasks", list(envs.TASKS), "Tasks; the suite replay takes the rows of the first one.")
-flags.DEFINE_list("algos", ["td3", "sac"], "Algorithms of the suites update and loop.")
+flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
 flags.DEFINE_integer("repeats", 5, "Timed calls per figure; the median counts.", lower_bound=1)

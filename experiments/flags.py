@@ -41,7 +41,8 @@ SETTING_HELP = {
     "subset_size": "critics drawn per update by --reduce=subset_min",
     "ensemble_size": "number of critics",
     "hidden": "widths of the hidden layers",
-    "networks": "mlp, or sale: TD7's, with its critic loss and its hard target copies",
+    "networks": "mlp, or sale: TD7's, with its critic loss, value bounds and hard target copies (SAC's next action is "
+    "then the target actor's)",
     "lr": "Adam's learning rate",
     "gamma": "discount factor",
     "tau": "soft-update rate of the target networks",

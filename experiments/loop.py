@@ -183,6 +183,12 @@ def train_loop(
     def send(metrics: dict[str, np.ndarray], returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
         report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths))
 
+    def measured(interval: IntervalMetrics) -> dict[str, np.ndarray]:
+        """The interval's means and the state's status; nothing before the first step."""
+        if not interval.sums:
+            return {}
+        return interval.result() | {name: np.asarray(value) for name, value in sweep.status(state).items()}
+
     for point in evaluation_steps(train):
         interval = IntervalMetrics()
         while done < point and not stop():
@@ -198,10 +204,10 @@ def train_loop(
         if stop():
             interrupted = True
             if interval.sums:
-                find_diverged(interval.result(), None)
-                send(interval.result(), None, None)
+                find_diverged(measured(interval), None)
+                send(measured(interval), None, None)
             break
-        evaluate_and_report(interval.result())
+        evaluate_and_report(measured(interval))
 
     timed = pace.steps * train.num_envs * num_members
     rate = timed / pace.train_seconds if pace.train_seconds else None

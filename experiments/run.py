@@ -54,15 +54,18 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     """
     from experiments.records import make_members
 
+    preset: dict[str, Any] = {}
     try:
         default = make_config(options.algo, options.env)
-        settings = preset_settings(options.preset, default.algo, default.env) | options.settings
+        preset = preset_settings(options.preset, default.algo, default.env)
+        settings = preset | options.settings
         configs = [
             make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
     except ConfigError as error:
-        raise flags.UsageError(str(error)) from None
+        by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
+        raise flags.UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
     members = make_members(options.seeds, configs)
     path = Path(options.out) / default.env / default.algo / (options.name or _default_name(options))
     try:

@@ -40,7 +40,7 @@ class Algorithm(NamedTuple):
 TEMPERATURE = frozenset({"temperature", "learn_temperature", "squashed_log_prob"})
 NOISE = frozenset({"exploration_noise", "target_noise", "target_noise_clip", "sampled_actor"})
 # What has no effect with the networks of a kind.
-IGNORED_WITH = {"mlp": frozenset(SALE_SETTINGS), "sale": frozenset({"tau", "learn_temperature"})}
+IGNORED_WITH = {"mlp": frozenset(SALE_SETTINGS), "sale": frozenset({"tau"})}
 
 SQT = {"penalty": "batch_std", "penalty_coef": 0.5}
 SQT_TUPLE = {"penalty": "transition_std", "penalty_coef": 0.1}
@@ -117,8 +117,9 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
     if row.assessed and config.networks != "sale":
         raise ConfigError("networks", f"takes sale for {algo}")
     for ignored, cause in ((row.ignores, algo), (IGNORED_WITH[config.networks], f"--networks={config.networks}")):
-        for name in ignored & settings.keys():
-            if settings[name] != getattr(AgentConfig, name):  # the default may be named: config.json names everything
+        for name in settings:
+            # The default may be named: config.json names everything.
+            if name in ignored and settings[name] != getattr(AgentConfig, name):
                 raise ConfigError(name.removeprefix("learn_"), f"has no effect with {cause}")
     return config
 

@@ -32,7 +32,9 @@ class AgentConfig:
     # Networks.
     ensemble_size: int = 2  # N
     hidden: tuple[int, ...] = (256, 256)
-    networks: str = "mlp"  # mlp | sale: TD7's, with its critic loss and its hard target copies
+    # mlp | sale: TD7's, with its critic loss, value bounds and hard target copies; SAC's next action is then the target
+    # actor's.
+    networks: str = "mlp"
     # Optimisation.
     lr: float = 3e-4
     gamma: float = 0.99
@@ -182,14 +184,22 @@ def check_agent(algo: str, agent: AgentConfig) -> None:
     if agent.penalty == "none":
         message = f"takes 0 for {algo}, which has no penalty (its _sqt and _sqt_tuple forms have one)"
         _refuse(agent.penalty_coef > 0, "penalty_coef", message)
+        _refuse(not agent.penalty_inside_gamma, "penalty_inside_gamma", f"has no effect with {algo}")
     else:
         _refuse(n < 2, "ensemble_size", f"takes at least 2 for {algo}: one critic alone has no disagreement")
     # Without a penalty too: the disagreement is reported, unless there is one critic alone.
     _refuse(n > 1 and agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
     if agent.reduce == "subset_min":
         _refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
+    if agent.reduce != "subset_min":
+        differs = agent.subset_size != AgentConfig.subset_size
+        _refuse(differs, "subset_size", f"has no effect with --reduce={agent.reduce}")
     if agent.learn_temperature:
         _refuse(agent.temperature <= 0, "temperature", "takes a positive start where it is learned")
+        _refuse(agent.networks == "sale", "temperature", "takes a number with --networks=sale, not auto")
+        # The target entropy is that of the action, summed over its dimensions.
+        message = "takes true where the temperature is learned"
+        _refuse(not agent.squashed_log_prob, "squashed_log_prob", message)
 
 
 def check_train(train: TrainConfig) -> None:

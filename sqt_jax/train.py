@@ -38,6 +38,7 @@ class Trainer(NamedTuple):
     init: Callable[..., TrainState]  # (key, scalars=None) -> state
     advance: Callable[[TrainState, Any, Any], tuple[TrainState, Metrics]]  # (state, num_steps, learn)
     evaluate: Callable[[TrainState], Evaluation]
+    status: Callable[[TrainState], Metrics]  # what is worth reporting of a state as it is
 
 
 class Sweep(NamedTuple):
@@ -46,6 +47,7 @@ class Sweep(NamedTuple):
     init: Callable[[Array, Scalars], TrainState]  # (keys [S], scalars of [S] each)
     advance: Callable[[TrainState, int, bool], tuple[TrainState, Metrics]]  # donates the state
     evaluate: Callable[[TrainState], Evaluation]
+    status: Callable[[TrainState], Metrics]
 
 
 class _Mean(NamedTuple):
@@ -124,7 +126,7 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
         learn = jnp.asarray(learn)
         state, mean = jax.lax.fori_loop(0, num_steps, lambda _, carry: step(carry[0], carry[1], learn), (state, mean))
         episodes = state.episodes
-        return state, mean.result() | agent.status(state.agent) | {
+        return state, mean.result() | {
             "train_return": episodes.ended_return / episodes.ended,
             "train_length": episodes.ended_length / episodes.ended,
             "train_episodes": episodes.ended,
@@ -139,7 +141,10 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
 
         return evaluate(env, policy, key, config.eval_episodes)
 
-    return Trainer(init, advance, evaluate_policy)
+    def status(state: TrainState) -> Metrics:
+        return agent.status(state.agent)
+
+    return Trainer(init, advance, evaluate_policy, status)
 
 
 def member_axes(state: State) -> Any:
@@ -161,6 +166,7 @@ def make_sweep(trainer: Trainer) -> Sweep:
         init=jax.jit(jax.vmap(trainer.init, out_axes=axes)),
         advance=jax.jit(jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=(axes, 0)), donate_argnums=0),
         evaluate=jax.jit(jax.vmap(trainer.evaluate, in_axes=(axes,))),
+        status=jax.jit(jax.vmap(trainer.status, in_axes=(axes,))),
     )
 
 
@@ -182,7 +188,8 @@ class History(NamedTuple):
     env_steps: Array  # [evaluations]
     returns: Array  # [evaluations, episodes]
     lengths: Array  # [evaluations, episodes]
-    metrics: Metrics  # [evaluations] each, means since the previous evaluation (where the warm-up ends: since then)
+    # [evaluations] each: means since the previous evaluation (where the warm-up ends: since then), and the status.
+    metrics: Metrics
 
 
 def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[TrainState, History]]:
@@ -201,7 +208,8 @@ def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[Tra
         def interval(state, count):
             state, metrics = jax.lax.scan(phase, state, (count, jnp.array([False, True])))
             last = jnp.where(count[1] > 0, 1, 0)  # the phase that the interval ends in
-            return state, (state.env_steps, trainer.evaluate(state), jax.tree.map(lambda m: m[last], metrics))
+            metrics = jax.tree.map(lambda m: m[last], metrics) | trainer.status(state)
+            return state, (state.env_steps, trainer.evaluate(state), metrics)
 
         start = trainer.init(key, scalars)
         state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, start, jnp.array(counts))

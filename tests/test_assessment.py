@@ -38,18 +38,18 @@ def story(state, *episodes, gradient_steps=0, learners=range(1, 100)):
     return state, rows
 
 
-START = assessment.Checkpoints(labelled(0), labelled(0), *map(jnp.float32, (-1e8, np.inf, 0, 0, 0)))
+START = assessment.Checkpoints(labelled(0), labelled(0), *map(jnp.float32, (-1e8, 1e8, 0, 0, 0)))
 
 
 def test_before_the_switch_each_episode_is_an_assessment():
     _, rows = story(START, 5.0, 3.0, 7.0, 7.0, -2.0)
     assert rows == [
         # snapshot, checkpoint, best, min, episodes, assessments, refreshes
-        (1, 0, 5, np.inf, 0, 1, 1),  # the policy that was assessed is the checkpoint, not the learner of now
-        (2, 0, 5, np.inf, 0, 2, 1),  # worse: 1 is given up
-        (3, 2, 7, np.inf, 0, 3, 2),
-        (4, 3, 7, np.inf, 0, 4, 3),  # as good is good enough
-        (5, 3, 7, np.inf, 0, 5, 3),
+        (1, 0, 5, 1e8, 0, 1, 1),  # the policy that was assessed is the checkpoint, not the learner of now
+        (2, 0, 5, 1e8, 0, 2, 1),  # worse: 1 is given up
+        (3, 2, 7, 1e8, 0, 3, 2),
+        (4, 3, 7, 1e8, 0, 4, 3),  # as good is good enough
+        (5, 3, 7, 1e8, 0, 5, 3),
     ]
 
 
@@ -59,12 +59,12 @@ def test_after_the_switch_an_assessment_takes_its_episodes_and_ends_early_below_
     assert rows == [
         (50, 0, 6, 8, 1, 0, 0),
         (50, 0, 6, 8, 2, 0, 0),  # the minimum, not the last
-        (3, 50, 7, np.inf, 0, 1, 1),
+        (3, 50, 7, 1e8, 0, 1, 1),
         (3, 50, 7, 9, 1, 1, 1),
-        (5, 50, 7, np.inf, 0, 2, 1),  # below the best: over after two episodes
+        (5, 50, 7, 1e8, 0, 2, 1),  # below the best: over after two episodes
         (5, 50, 7, 7, 1, 2, 1),
         (5, 50, 7, 7, 2, 2, 1),
-        (8, 5, 7, np.inf, 0, 3, 2),
+        (8, 5, 7, 1e8, 0, 3, 2),
     ]
 
 
@@ -77,7 +77,7 @@ def test_an_assessment_that_the_switch_finds_under_way_goes_on():
     state = assess(START, 1, SWITCH, 5.0)
     assert (state.episodes, state.assessments) == (1, 0)
     _, rows = story(state, 6.0, 4.0, gradient_steps=SWITCH + 100, learners=[2, 3])
-    assert rows == [(0, 0, -1e8, 5, 2, 0, 0), (3, 0, 4, np.inf, 0, 1, 1)]
+    assert rows == [(0, 0, -1e8, 5, 2, 0, 0), (3, 0, 4, 1e8, 0, 1, 1)]
 
 
 @pytest.mark.parametrize("episode_return", [-1e9, 5.0, 1e9])

@@ -48,6 +48,27 @@ def test_a_run_leaves_its_files(finished):
     assert not any(name.endswith(".part") for name in names)
 
 
+@pytest.mark.parametrize("preset", ["paper", "released"])
+def test_td7_tells_of_its_checkpoints(preset, tmp_path):
+    """TD7's state and metrics are unlike the others': a whole run of it."""
+    more = ("--algo=td7_sqt", "--embedding_size=8", f"--preset={preset}", "--policy_delay=2")
+    assert run(tmp_path, *more) == 0
+    path = tmp_path / "ant" / "td7_sqt" / "run"
+    evaluations, metrics = rows_of(path / "evaluations.csv"), rows_of(path / "metrics.csv")
+    assert len(evaluations) == 8 and all(np.isfinite(float(row["return_mean"])) for row in evaluations)
+    assert evaluations[-1]["gradient_steps"] == ("180" if preset == "released" else "90")
+    last = metrics[-1]
+    # Episodes of 5 steps from step 30 to 120; each is an assessment, and all returns are equal, which is good enough.
+    assert (last["env_steps"], last["assessments"], last["checkpoint_refreshes"]) == ("120", "18.0", "18.0")
+    assert float(last["best_min_return"]) == float(last["train_return"])
+
+
+def test_a_released_run_of_td3_has_sale_networks(tmp_path):
+    assert run(tmp_path, "--algo=td3_sqt", "--embedding_size=8", "--preset=released") == 0
+    config = json.loads((tmp_path / "ant" / "td3_sqt" / "run" / "config.json").read_text())
+    assert (config["preset"], config["settings"]["networks"]) == ("released", "sale")
+
+
 def test_evaluations_of_a_run(finished):
     rows = rows_of(finished[1] / "evaluations.csv")
     assert tuple(rows[0]) == records.EVALUATION_COLUMNS
@@ -206,6 +227,10 @@ BAD = [
     ("--env=antt", "--env: takes one of cheetah, walker, ant, humanoid"),
     ("--algo=sac --penalty_coef=0.5", "--penalty_coef: takes 0 for sac"),
     ("--algo=td3_sqt --temperature=0.1,0.2", "--temperature: has no effect with td3_sqt"),
+    (
+        "--algo=td3 --preset=released --networks=mlp",
+        "--train_encoder: has no effect with --networks=mlp (set by --preset=released)",
+    ),
     ("--algo=td7_sqt --num_envs=2 --steps=100", "--num_envs: takes 1 for td7_sqt"),
     ("--penalty_coef=-1", "--penalty_coef: takes a number of at least 0"),
     ("--ensemble_size=1", "--ensemble_size: takes at least 2 for sac_sqt"),
@@ -236,7 +261,7 @@ def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, l
 def test_unknown_physics_is_refused(tmp_path, capsys):
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--physics=warp9"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("--physics: takes one of mjx, not 'warp9'") and err.count("\n") == 1
+    assert err.startswith("--physics: takes one of mjx, mujoco, not 'warp9'") and err.count("\n") == 1
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):

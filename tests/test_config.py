@@ -199,7 +199,7 @@ def test_a_setting_without_effect_on_these_networks_is_refused(networks, setting
 
 
 def test_the_temperature_is_fixed_with_sale_networks():
-    with pytest.raises(ConfigError, match="--temperature: has no effect with --networks=sale$"):
+    with pytest.raises(ConfigError, match="--temperature: takes a number with --networks=sale, not auto$"):
         make_config("sac", "ant", networks="sale", learn_temperature=True)
 
 

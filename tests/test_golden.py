@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from experiments.presets import preset_settings
-from sqt_jax import lap
+from sqt_jax import lap, q_targets
 from sqt_jax.agents import sac, td3, td7
 from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS
 from sqt_jax.config import AgentConfig
@@ -21,6 +21,8 @@ from sqt_jax.types import Transition
 DATA = Path(__file__).parent / "data" / "golden"
 FOLDER = Path(os.environ.get("SQT_GOLDEN_DIR", DATA))
 FILES = sorted(FOLDER.glob("*.npz"))
+if not FILES:
+    raise FileNotFoundError(f"no traces (*.npz) in {FOLDER}")
 TOLERANCE = {"rtol": 1e-5, "atol": 3e-6}
 
 
@@ -39,7 +41,8 @@ def tree(arrays: dict, prefix: str) -> dict:
 def build(arrays: dict, name: str, **changes):
     """The agent that a file describes, its state before the first update, and its batches [K, B, ...].
 
-    `name` is the file's: `[released_]<algorithm>_<plain, sqt or sqt_tuple>`.
+    `name` is the file's: `[released_]<algorithm>_<plain, sqt or sqt_tuple>`. All its networks have the same hidden
+    widths, those of the critics.
     """
     batch = tree(arrays, "batch")
     nets = tree(arrays, "init")
@@ -113,6 +116,24 @@ def test_there_is_a_trace_of_each_of_the_nine_and_of_the_released_code():
     bases = ("td3", "sac", "td7")
     nine = {f"{base}_{variant}" for base in bases for variant in ("plain", "sqt", "sqt_tuple")}
     assert names == nine | {f"released_{base}_sqt" for base in bases}
+
+
+def swapped(clip_and_penalty):
+    """`q_targets.td_target` with the penalty before the clipping."""
+
+    def td_target(*args, penalty, value_bounds=None, reduce=q_targets.min_over_critics, **rest):
+        def penalised(next_q):
+            return reduce(next_q) - penalty(next_q)
+
+        return clip_and_penalty(*args, reduce=penalised, value_bounds=value_bounds, **rest)
+
+    return td_target
+
+
+@pytest.mark.parametrize("name", ["td7_sqt", "td7_sqt_tuple", "released_td7_sqt"])
+def test_the_traces_notice_a_penalty_before_the_clipping(name, monkeypatch):
+    monkeypatch.setattr(q_targets, "td_target", swapped(q_targets.td_target))
+    assert replay_trace(dict(np.load(DATA / f"{name}.npz")), name)["trace/td_target"] > 30
 
 
 FORMULA = [

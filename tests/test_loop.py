@@ -23,7 +23,7 @@ class Recorder:
         self.train, self.breaks_at = train, breaks_at
         self.now, self.done = 0.0, 0
         self.calls, self.reports, self.statuses, self.messages = [], [], [], []
-        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate)
+        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate, status=self.status)
         self.evaluated = lambda steps, returns: None
         self.update, self.message = self.statuses.append, self.messages.append
 
@@ -42,6 +42,9 @@ class Recorder:
             "train_length": np.full(2, np.nan),
         }
         return SimpleNamespace(agent=agent), {"loss": loss} | episodes
+
+    def status(self, state):
+        return {"best": np.full(2, float(self.done))}
 
     def evaluate(self, state):
         self.now += 0.5
@@ -71,6 +74,14 @@ def test_evaluations_lie_at_zero_every_interval_and_the_end():
     assert recorder.reports[0].metrics == {}
     assert recorder.reports[2].returns.tolist() == [[1_000, 1_002], [0, 0]]
     assert (outcome.env_steps, outcome.interrupted, outcome.diverged) == (2_000, False, {})
+
+
+def test_metrics_of_an_interval_are_means_and_the_status_is_that_of_its_end():
+    recorder = Recorder(TRAIN)
+    recorder.run()
+    assert len([learn for _, learn in recorder.calls if learn]) > len(recorder.reports)  # intervals of several chunks
+    last = recorder.reports[-1].metrics
+    assert last["best"].tolist() == [2_000, 2_000] and np.all(last["loss"] < 2_000)
 
 
 def test_the_full_protocol_has_201_evaluations():

@@ -78,7 +78,7 @@ def test_everything_starts_as_the_learner():
     assert same(state.checkpoints.snapshot, td7.Policy(state.actor, state.encoder))
     assert same(state.checkpoints.checkpoint, state.checkpoints.snapshot)
     assert same(state.value_bounds, td7.ValueBounds(1e8, -1e8, 0.0, 0.0))
-    assert same(state.checkpoints[2:], (-1e8, np.inf, 0, 0, 0))
+    assert same(state.checkpoints[2:], (-1e8, 1e8, 0, 0, 0))
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves((state.actor_opt, state.critic_opt, state.encoder_opt)))
 
 
@@ -311,7 +311,7 @@ def trained():
     for _ in range(12):
         state, measured = sweep.advance(state, EPISODE, True)
         states.append(jax.device_get(state.agent))
-        metrics.append(jax.device_get(measured))
+        metrics.append(jax.device_get(measured | sweep.status(state)))
     return Trained(agent_of(config, env), sweep, warm, jax.device_get(warm_metrics), states, metrics, state)
 
 
@@ -320,7 +320,7 @@ def test_the_warm_ups_episodes_are_not_assessed(trained):
     assert np.all(trained.warm_metrics["train_episodes"] == 4)
     checkpoints = trained.warm.agent.checkpoints
     assert np.all(checkpoints.assessments == 0) and np.all(checkpoints.refreshes == 0)
-    assert np.all(checkpoints.best_min_return == np.float32(-1e8)) and np.all(checkpoints.min_return == np.inf)
+    assert np.all(checkpoints.best_min_return == np.float32(-1e8)) and np.all(checkpoints.min_return == 1e8)
 
 
 def test_each_training_episode_is_assessed_by_the_rule(trained):

@@ -13,6 +13,9 @@ import jax.numpy as jnp
 from sqt_jax.config import AgentConfig
 from sqt_jax.types import Array, Metrics, Params
 
+# The smallest return of no episodes: finite, so that what is not finite in an agent's state tells of divergence.
+NONE = 1e8
+
 
 class Checkpoints(NamedTuple):
     """The policy that acts, the best one so far, and the assessment under way."""
@@ -29,7 +32,7 @@ class Checkpoints(NamedTuple):
 def start(policy: Params) -> Checkpoints:
     """Before the first episode: `policy` acts, and any return is better than the best so far."""
     zero = jnp.zeros(())
-    return Checkpoints(policy, policy, jnp.float32(-1e8), jnp.full((), jnp.inf), zero, zero, zero)
+    return Checkpoints(policy, policy, jnp.float32(-NONE), jnp.float32(NONE), zero, zero, zero)
 
 
 def assess(
@@ -56,7 +59,7 @@ def assess(
         snapshot=select(over, learner, state.snapshot),
         checkpoint=select(better, state.snapshot, state.checkpoint),
         best_min_return=jnp.where(better, min_return, state.best_min_return),
-        min_return=jnp.where(over, jnp.inf, jnp.where(ended, min_return, state.min_return)),
+        min_return=jnp.where(over, NONE, jnp.where(ended, min_return, state.min_return)),
         episodes=jnp.where(over, 0, jnp.where(ended, episodes, state.episodes)),
         assessments=state.assessments + over,
         refreshes=state.refreshes + better,

@@ -56,7 +56,15 @@ def actions(config: AgentConfig) -> Actions:
     def own_action(output: networks.Gaussian, noise: SACNoise) -> tuple[Array, Array]:
         return output.sample(noise.action_eps, config.squashed_log_prob)
 
-    return Actions(True, True, greedy, explore, draw_noise, next_action, own_action)
+    return Actions(
+        gaussian=True,
+        entropy=True,
+        greedy=greedy,
+        explore=explore,
+        draw_noise=draw_noise,
+        next_action=next_action,
+        own_action=own_action,
+    )
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:

@@ -67,7 +67,15 @@ def actions(config: AgentConfig) -> Actions:
     def own_action(output: Output, noise: TD3Noise) -> tuple[Array, Array]:
         return output.sample(noise.action_eps)[0] if config.sampled_actor else output, jnp.zeros(())
 
-    return Actions(config.sampled_actor, False, greedy, explore, draw_noise, next_action, own_action)
+    return Actions(
+        gaussian=config.sampled_actor,
+        entropy=False,
+        greedy=greedy,
+        explore=explore,
+        draw_noise=draw_noise,
+        next_action=next_action,
+        own_action=own_action,
+    )
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
