@@ -26,6 +26,7 @@ MAX_SEED = 2**32 - 1
 # What each setting is, for --help: a new field of the configuration becomes a flag by itself and wants a line here.
 SETTING_HELP = {
     "physics": "what computes the environment's physics",
+    "eval_physics": "the same for evaluation; auto: mujoco on a CPU, else the training's",
     "steps": "environment steps per member",
     "warmup_steps": "first steps, with uniform random actions and no updates",
     "batch_size": "transitions per update",
@@ -166,7 +167,14 @@ FLAGS: dict[str, list[_Flag]] = {
             "algorithm: td3, sac or td7, alone or with _sqt or _sqt_tuple; maxmin or redq, alone or with _sqt",
             "required",
         ),
-        _Flag("env", str, "a name", "environment: cheetah, walker, ant or humanoid", "required"),
+        _Flag(
+            "env",
+            str,
+            "a name",
+            "environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's v4); "
+            "NAME-v5 for its v5",
+            "required",
+        ),
         *_settings(Config),
         _Flag(
             "seeds",

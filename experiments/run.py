@@ -44,6 +44,7 @@ class Plan(NamedTuple):
     swept: list[str]
     path: Path
     env: Environment
+    own_env: Environment | None  # which takes the place of the named one
     options: flags.Options
 
 
@@ -74,8 +75,9 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     except OSError as error:
         raise flags.UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
 
+    own_env = env
     try:
-        env = env or envs.make(default.env, configs[0].physics)
+        env = own_env or envs.make(default.env, configs[0].physics)
     except ValueError as error:
         raise flags.UsageError(f"--physics: {error}") from None
     needed, free = memory_estimate(configs[0], len(members), env), _free_memory()
@@ -84,7 +86,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
             f"--replay_capacity={configs[0].train.replay_capacity}: {len(members)} members need about "
             f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; takes a smaller number, or fewer --seeds"
         )
-    return Plan(members, list(options.sweep), path, env, options)
+    return Plan(members, list(options.sweep), path, env, own_env, options)
 
 
 def run(plan: Plan, command: Sequence[str]) -> int:
@@ -110,7 +112,7 @@ def run(plan: Plan, command: Sequence[str]) -> int:
             evaluations = len(evaluation_steps(train))
             share = progress.evaluation_share(train.steps, evaluations, train.eval_episodes, env.episode_length)
             console.print(share, soft_wrap=True, highlight=False)
-        sweep = make_sweep(make_trainer(config, env))
+        sweep = make_sweep(make_trainer(config, plan.own_env))
         seeds = jnp.array([member.seed for member in members], jnp.uint32)
         scalars = Scalars(
             *(

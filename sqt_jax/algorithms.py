@@ -130,12 +130,12 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     Args:
       algo: a name of `ALGORITHMS`.
       env: a name that `sqt_jax.envs.make` knows.
-      **settings: fields of `AgentConfig` and `TrainConfig` by name, and `physics`.
+      **settings: fields of `AgentConfig` and `TrainConfig` by name, `physics` and `eval_physics`.
 
     Raises:
       ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
     """
-    physics = settings.pop("physics", Config.physics)
+    physics, eval_physics = settings.pop("physics", Config.physics), settings.pop("eval_physics", Config.eval_physics)
     training = {name: settings.pop(name) for name in TRAIN_SETTINGS & settings.keys()}
     if algo in ALGORITHMS:
         _refuse_unknown(settings, AGENT_SETTINGS | TRAIN_SETTINGS)
@@ -146,11 +146,13 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
         raise ConfigError("env", str(error)) from None
     if physics not in envs.PHYSICS:
         raise ConfigError("physics", unknown(physics, envs.PHYSICS))
+    if eval_physics != "auto" and eval_physics not in envs.PHYSICS:
+        raise ConfigError("eval_physics", unknown(eval_physics, ["auto", *envs.PHYSICS]))
     train_config = TrainConfig(**{**ALGORITHMS[algo].training, **training})
     check_train(train_config)
     if ALGORITHMS[algo].assessed and train_config.num_envs > 1:
         raise ConfigError("num_envs", f"takes 1 for {algo}, whose policies are assessed one episode after another")
-    return Config(algo, env, physics, agent, train_config)
+    return Config(algo, env, physics, eval_physics, agent, train_config)
 
 
 def make_agent(algo: str, observation_size: int, action_size: int, **settings: Any) -> Agent:
@@ -182,8 +184,19 @@ def replay_of(config: Config, env: Environment) -> Replay:
 
 def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:
     """Training of one member as pure functions; `env` takes the place of the named environment."""
-    env = env or envs.make(config.env, config.physics)
-    return train.make_trainer(agent_of(config, env), env, replay_of(config, env), config.train)
+    eval_env = env
+    if env is None:
+        env = envs.make(config.env, config.physics)
+        physics = eval_physics_of(config)
+        eval_env = env if physics == config.physics else envs.make(config.env, physics)
+    return train.make_trainer(agent_of(config, env), env, replay_of(config, env), config.train, eval_env)
+
+
+def eval_physics_of(config: Config) -> str:
+    """The physics that evaluation plays on: with `auto`, MuJoCo C where it is the faster one."""
+    if config.eval_physics != "auto":
+        return config.eval_physics
+    return "mujoco" if jax.default_backend() == "cpu" else config.physics
 
 
 def make_train(config: Config, env: Environment | None = None) -> Callable[..., tuple[train.TrainState, train.History]]:

@@ -97,12 +97,13 @@ class Config:
     algo: str
     env: str
     physics: str = "mjx"
+    eval_physics: str = "auto"  # auto: MuJoCo C where the program runs on a CPU, else the training's
     agent: AgentConfig = AgentConfig()
     train: TrainConfig = TrainConfig()
 
     def flat(self) -> dict[str, Any]:
         """All settings by name, without nesting: what `config.json` holds and `make_config` takes back."""
-        own = {"algo": self.algo, "env": self.env, "physics": self.physics}
+        own = {"algo": self.algo, "env": self.env, "physics": self.physics, "eval_physics": self.eval_physics}
         return own | dataclasses.asdict(self.agent) | dataclasses.asdict(self.train)
 
 

@@ -68,8 +68,13 @@ class _Mean(NamedTuple):
         return jax.tree.map(lambda t, w: t / w, self.total, self.weight)  # 0 / 0 = NaN: never measured
 
 
-def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainConfig) -> Trainer:
-    """Joins an agent, an environment and a replay buffer into the training of one member."""
+def make_trainer(
+    agent: Agent, env: Environment, replay: Replay, config: TrainConfig, eval_env: Environment | None = None
+) -> Trainer:
+    """Joins an agent, an environment and a replay buffer into the training of one member.
+
+    `eval_env` is what evaluation plays, if not `env`: the same task on other physics.
+    """
     num_envs = config.num_envs
     updates = num_envs * config.updates_per_step  # per lockstep step, so that UTD is per transition
 
@@ -139,10 +144,10 @@ def make_trainer(agent: Agent, env: Environment, replay: Replay, config: TrainCo
         def policy(obs):
             return agent.act(state.agent, obs, key, deterministic=True)
 
-        return evaluate(env, policy, key, config.eval_episodes)
+        return evaluate(eval_env or env, policy, key, config.eval_episodes)
 
     def status(state: TrainState) -> Metrics:
-        return agent.status(state.agent)
+        return agent.status(state.agent) | jax.tree.map(jnp.sum, jax.vmap(env.status)(state.timestep))
 
     return Trainer(init, advance, evaluate_policy, status)
 

@@ -60,6 +60,7 @@ class Environment(NamedTuple):
     reset: Callable[[Array], TimeStep]  # key -> first time step
     step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
     set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
+    status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts worth reporting, summed over environments
 
 
 class Agent(NamedTuple):

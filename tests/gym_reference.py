@@ -69,6 +69,41 @@ def recorded(name: str) -> Recorded:
     return Recorded(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
+MJX_TASKS = ("cheetah", "walker", "ant", "humanoid")  # compiled in the fast suite; the others are marked slow
+
+
+class Episode(NamedTuple):
+    """A whole episode in Gymnasium from given (qpos, qvel), float32 numbers: what each of its steps gave."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    first_obs: np.ndarray
+    actions: np.ndarray  # [T, A] in [-1, 1]
+    obs: np.ndarray  # [T, O]
+    reward: np.ndarray  # [T]
+    terminated: np.ndarray  # [T]
+
+
+def episode(name: str, seed: int, scale: float, steps: int = 1000) -> Episode:
+    """Random actions of a size in [-scale, scale] until the episode terminates."""
+    env = gymnasium_environment(name)
+    env.reset(seed=seed)
+    qpos, qvel = env.data.qpos.astype(np.float32), env.data.qvel.astype(np.float32)
+    mujoco.mj_resetData(env.model, env.data)
+    env.set_state(qpos.astype(np.float64), qvel.astype(np.float64))
+    first_obs = env._get_obs()
+    generator = np.random.default_rng(seed)
+    limit = env.model.actuator_ctrlrange[:, 1].astype(np.float32)
+    actions, rows = [], []
+    for _ in range(steps):
+        actions.append(generator.uniform(-scale, scale, env.model.nu).astype(np.float32))
+        obs, reward, terminated, *_ = env.step(actions[-1] * limit)
+        rows.append((obs, reward, terminated))
+        if terminated:
+            break
+    return Episode(qpos, qvel, first_obs, np.array(actions), *(np.array(column) for column in zip(*rows, strict=True)))
+
+
 @cache
 def environment(name: str) -> Environment:
     return envs.make(name)

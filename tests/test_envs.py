@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gym_reference import COUNT, compiled_reset, compiled_step, environment
+from gym_reference import COUNT, compiled_reset, compiled_step
 
 from sqt_jax import envs
 from sqt_jax.envs.autoreset import make_environment
@@ -134,6 +134,27 @@ def test_a_step_that_is_not_finite_terminates_with_reward_0_and_the_observation_
     assert ENV.step(after, GO).reward == 1  # the next episode is not harmed
 
 
+def test_steps_beyond_all_numbers_are_counted_over_all_episodes():
+    bad = jnp.array([0.5, 0.0, 1.0])
+    timesteps = play([GO, bad, GO, END, GO, bad, bad, GO])
+    counts = [int(ENV.status(timestep)["unstable_steps"]) for timestep in timesteps]
+    assert counts == [0, 0, 1, 1, 1, 1, 2, 3, 3]
+
+
+def test_numbers_beyond_mujocos_own_limit_are_diverged():
+    def advance(state, action):
+        return state, jnp.full(1, 1e9) * action, jnp.zeros(()), jnp.zeros((), bool)
+
+    env = make_environment("large", 1, 1, LENGTH, lambda key: (jnp.zeros(()), jnp.zeros(1)), advance)
+    fine, beyond = env.step(env.reset(jax.random.key(0)), jnp.ones(1)), None
+    assert not fine.terminated and fine.final_obs == 1e9
+    env = make_environment(
+        "larger", 1, 1, LENGTH, lambda key: (jnp.zeros(()), jnp.zeros(1)), lambda s, a: (s, 2e10 * a, 0.0, False)
+    )
+    beyond = env.step(env.reset(jax.random.key(0)), jnp.ones(1))
+    assert beyond.terminated and beyond.final_obs == 0
+
+
 def test_under_vmap_only_the_environment_that_ended_restarts():
     timesteps = jax.vmap(ENV.reset)(jax.random.split(jax.random.key(0), 3))
     after = jax.vmap(ENV.step)(timesteps, jnp.stack([GO, END, GO]))
@@ -184,10 +205,12 @@ def test_the_cheetahs_time_limit_is_1000_steps_and_its_starts_are_new():
 
 
 @pytest.mark.parametrize("name", envs.TASKS)
-def test_sizes_are_those_of_the_papers_table_1(name):
+def test_sizes_are_those_of_gymnasium_and_of_the_papers_table_1(name):
     sizes = {"cheetah": (17, 6), "walker": (17, 6), "ant": (27, 8), "humanoid": (376, 17)}
-    env = environment(name)
-    assert (env.observation_size, env.action_size) == sizes[name]
+    sizes |= {"hopper": (11, 3), "swimmer": (8, 2), "humanoid_standup": (376, 17)}
+    v5 = {"ant-v5": (105, 8), "humanoid-v5": (348, 17), "humanoid_standup-v5": (348, 17)}
+    env = envs.make(name, "mujoco")
+    assert (env.observation_size, env.action_size) == v5.get(name, sizes[name.removesuffix("-v5")])
     assert env.episode_length == 1000
     assert env.name == name
 
@@ -196,6 +219,24 @@ def test_sizes_are_those_of_the_papers_table_1(name):
 def test_aliases(alias, name):
     assert envs.resolve(alias) == name
     assert name in envs.TASKS
+
+
+@pytest.mark.parametrize("name", envs.TASKS)
+def test_gymnasiums_own_ids_are_names(name):
+    assert envs.resolve(envs.TASKS[name].gymnasium_id) == name
+
+
+@pytest.mark.parametrize(
+    ("alias", "name"), [("ant-v4", "ant"), ("walker2d-v5", "walker-v5"), ("HumanoidStandup-v5", "humanoid_standup-v5")]
+)
+def test_versions_of_names_and_aliases(alias, name):
+    assert envs.resolve(alias) == name
+
+
+@pytest.mark.parametrize("name", ["ant-v3", "ant-v6", "ant-v", "ant-v5-v5", "-v5", ""])
+def test_other_versions_are_unknown(name):
+    with pytest.raises(ValueError, match="takes one of cheetah, "):
+        envs.resolve(name)
 
 
 @pytest.mark.parametrize("call", [envs.resolve, envs.make], ids=["resolve", "make"])

@@ -29,11 +29,40 @@ def state(qpos=(0.0,), qvel=(0.0,), displacement=0.0, quantities=None):
         ("walker", [0.5, -0.5, 1, 0, 0, 0], 2 + 1 - 0.001 * 1.5),
         ("ant", [0.5, -0.5, 1, 0, 0, 0, 0, 0], 2 + 1 - 0.5 * 1.5),
         ("humanoid", [0.4] * 10 + [0] * 7, 1.25 * 2 + 5 - 0.1 * 1.6),
+        ("hopper", [0.5, -0.5, 1], 2 + 1 - 0.001 * 1.5),
+        ("swimmer", [0.5, -1], 2 - 1e-4 * 1.25),
+        ("humanoid_standup", [0.4] * 10 + [0] * 7, 0.5 / 0.003 + 1 - 0.1 * 1.6),
     ],
 )
 def test_reward_by_hand(name, control, expected):
-    reward = gym_tasks.reward(TASKS[name], state(displacement=0.1), jnp.asarray(control, jnp.float32), 0.05)
-    np.testing.assert_allclose(reward, expected, rtol=1e-6)
+    there = state([0, 0, 0.5], displacement=0.1, quantities={"cfrc_ext": jnp.zeros(12)})
+    control = jnp.asarray(control, jnp.float32)
+    for task in (TASKS[name], TASKS[f"{name}-v5"]):
+        for ended in (False, True):
+            reward = gym_tasks.reward(task, there, control, 0.05, jnp.array(ended))
+            # v5 does not reward the step that terminates for being alive.
+            lost = task.alive if ended and task.gymnasium_id.endswith("-v5") and task.healthy else 0
+            np.testing.assert_allclose(reward, expected - lost, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "forces", "cost"),
+    [
+        ("ant", [3.0, -0.5], 0),
+        ("ant-v5", [3.0, -0.5], 5e-4 * (1 + 0.25)),  # each force clipped to 1
+        ("humanoid", [3000.0, 0], 0),
+        ("humanoid-v5", [3000.0, 0], 5e-7 * 9e6),
+        ("humanoid-v5", [9000.0, 0], 10),  # the whole cost clipped to 10
+        ("humanoid_standup", [3000.0, 0], 5e-7 * 9e6),
+        ("humanoid_standup-v5", [-9000.0, 0], 10),
+    ],
+)
+def test_cost_of_contacts(name, forces, cost):
+    def reward(forces):
+        there = state([0, 0, 0.0], quantities={"cfrc_ext": jnp.asarray(forces, jnp.float32)})
+        return gym_tasks.reward(TASKS[name], there, jnp.zeros(2), 0.05, jnp.zeros((), bool))
+
+    np.testing.assert_allclose(reward([0.0, 0.0]) - reward(forces), cost, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -51,14 +80,27 @@ def test_reward_by_hand(name, control, expected):
         ("humanoid", [9, 9, 1.4], True),
         ("humanoid", [9, 9, 1.0], False),  # its limits are not
         ("humanoid", [9, 9, 2.0], False),
+        ("hopper", [9, 0.71, 0.19], True),
+        ("hopper", [9, 0.69, 0], False),
+        ("hopper", [9, 1.25, 0.21], False),
+        ("hopper", [9, 1.25, -0.21], False),
+        ("hopper", [9, 1.25, 0, 101], False),
     ],
 )
 def test_healthy_ranges(name, qpos, healthy):
-    assert bool(TASKS[name].healthy(jnp.asarray(qpos, jnp.float32))) is healthy
+    for task in (TASKS[name], TASKS[f"{name}-v5"]):
+        assert bool(task.healthy(jnp.asarray(qpos, jnp.float32), jnp.zeros(2))) is healthy
 
 
-def test_cheetah_never_terminates():
-    assert TASKS["cheetah"].healthy is None
+def test_the_hopper_falls_by_a_velocity_too():
+    qpos = jnp.array([9, 1.25, 0.0])
+    velocities = {99.0: True, 100.0: False, -101.0: False}
+    assert {v: bool(TASKS["hopper"].healthy(qpos, jnp.array([0, v]))) for v in velocities} == velocities
+
+
+def test_three_tasks_never_terminate():
+    never = {name.removesuffix("-v5") for name, task in TASKS.items() if task.healthy is None}
+    assert never == {"cheetah", "swimmer", "humanoid_standup"}
 
 
 def test_observation_leaves_out_the_horizontal_position():
@@ -75,6 +117,16 @@ def test_humanoid_observes_its_quantities_in_order():
     fields["cinert"] = jnp.full(1, 1.0)
     obs = gym_tasks.observe(TASKS["humanoid"], state([7, 7, 0], [0], quantities=fields))
     np.testing.assert_array_equal(obs, [0, 0, 1, 2, 3, 4])
+
+
+def test_v5_leaves_out_the_worlds_entries_and_the_roots_forces_and_clips():
+    width = {"cinert": 20, "cvel": 12, "qfrc_actuator": 8, "cfrc_ext": 12}
+    fields = {name: jnp.arange(size) - 8.0 for name, size in width.items()}
+    obs = gym_tasks.observe(TASKS["humanoid-v5"], state([7, 7, 0.5], [0.25], quantities=fields))
+    parts = [np.arange(2.0, 12), np.arange(-2.0, 4), np.arange(-2.0, 0), np.arange(-2.0, 4)]
+    np.testing.assert_array_equal(obs, np.concatenate([[0.5, 0.25], *parts]))
+    obs = gym_tasks.observe(TASKS["ant-v5"], state([7, 7, 0.5], [0.25], quantities=fields))
+    np.testing.assert_array_equal(obs, [0.5, 0.25, -1, -1, 0, 1, 1, 1])
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -96,13 +148,15 @@ def test_starts_have_gymnasiums_distribution(name):
     assert np.abs(np.corrcoef(offset[:, 0], velocity[:, 0])[0, 1]) < 0.06  # positions and velocities: own draws
 
 
-@pytest.mark.parametrize(("name", "limit"), [("cheetah", 1.0), ("walker", 1.0), ("ant", 1.0), ("humanoid", 0.4)])
-def test_actions_are_stretched_to_the_actuators_range(name, limit, recording_physics):
+@pytest.mark.parametrize("name", TASKS)
+def test_actions_are_stretched_to_the_actuators_range(name, recording_physics):
+    limit = 0.4 if name.startswith("humanoid") else 1.0
     env = envs.make(name, physics="recording")
     action = jnp.linspace(-1, 1, env.action_size)
     timestep = env.step(env.reset(jax.random.key(0)), action)
     np.testing.assert_allclose(timestep.state.task.internal, limit * action, rtol=1e-6)
     expected = TASKS[name].alive - TASKS[name].ctrl_cost * np.sum((limit * np.asarray(action)) ** 2)
+    expected += TASKS[name].height * float(timestep.state.task.qpos[2])
     np.testing.assert_allclose(timestep.reward, expected, rtol=1e-5)  # the cost is that of the stretched action
     excess = env.step(env.reset(jax.random.key(0)), 5 * jnp.ones(env.action_size))
     np.testing.assert_allclose(excess.state.task.internal, limit, rtol=1e-6)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from gym_reference import ours, placed, recorded
+from gym_reference import MJX_TASKS, ours, placed, recorded
 
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
@@ -161,7 +161,7 @@ def equations(jaxpr, primitive):
                     yield from equations(inner, primitive)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", MJX_TASKS)
 def test_first_state_is_at_rest_of_forces(name):
     timestep = placed(name)
     forces = {k: v for k, v in timestep.state.task.quantities.items() if k in ("qfrc_actuator", "cfrc_ext")}

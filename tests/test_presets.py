@@ -5,7 +5,6 @@ from probe_envs import constant_reward
 from experiments.presets import PRESETS, Row, preset_settings
 from sqt_jax.algorithms import ALGORITHMS, make_config, make_train
 from sqt_jax.config import ConfigError
-from sqt_jax.envs import TASKS
 
 NINE = [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))]
 NOT_RELEASED = [algo for algo in ALGORITHMS if algo not in NINE]
@@ -14,7 +13,7 @@ NOT_RELEASED = [algo for algo in ALGORITHMS if algo not in NINE]
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_is_a_configuration_for_every_algorithm_and_environment(preset):
     for algo in NINE if preset == "released" else ALGORITHMS:
-        for env in TASKS:
+        for env in ("cheetah", "humanoid-v5"):
             settings = preset_settings(preset, algo, env)
             flat = make_config(algo, env, **settings).flat()
             assert {name: flat[name] for name in settings} == settings

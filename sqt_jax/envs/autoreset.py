@@ -9,8 +9,9 @@ The contract (one test per sentence in tests/test_envs.py):
   truncated, as in Gymnasium; there is no value beyond a terminated step, so `discount = 1 - terminated`.
 - After an ended episode `obs` and `state` are those of a new episode with a new random start, and `final_obs` is the
   true last observation of the old one. Elsewhere `final_obs` equals `obs`.
-- A step whose reward or observation is not finite (diverged physics) ends the episode as terminated with reward 0;
-  its `final_obs` is the observation before it, so that nothing that is not finite leaves an environment.
+- A step whose reward or observation is not finite, or beyond 1e10 (diverged physics), ends the episode as terminated
+  with reward 0; its `final_obs` is the observation before it, so that nothing that is not finite leaves an environment.
+- `status` counts such steps, as `unstable_steps`.
 """
 
 from collections.abc import Callable
@@ -18,8 +19,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from sqt_jax.types import Array, Environment, State, TimeStep
+from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
+
+LARGEST = 1e10  # MuJoCo's own limit (mjMAXVAL): beyond it, a simulation has diverged
 
 Start = Callable[[Array], tuple[State, Array]]
 Advance = Callable[[State, Array], tuple[State, Array, Array, Array]]
@@ -32,6 +36,7 @@ class Episode(NamedTuple):
     task: State  # what the task's own functions carry (for the Gymnasium tasks: a `PhysicsState`)
     steps: Array  # [] int32: steps made in this episode
     key: Array  # [] typed key: draws the starts of the episodes after this one
+    unstable: Array  # [] int32: steps so far, of all episodes, in which the physics diverged
 
 
 def make_environment(
@@ -53,38 +58,48 @@ def make_environment(
         episodes to come start from a fixed key.
     """
 
-    def begin(task: State, obs: Array, key: Array) -> TimeStep:
+    def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
         no = jnp.zeros((), bool)
         obs = jnp.asarray(obs, jnp.float32)
-        episode = Episode(task, jnp.zeros((), jnp.int32), key)
+        episode = Episode(task, jnp.zeros((), jnp.int32), key, unstable)
         return TimeStep(episode, obs, jnp.zeros((), jnp.float32), no, no, obs)
 
-    def reset(key: Array) -> TimeStep:
+    none = np.zeros((), np.int32)
+
+    def fresh(key: Array, unstable: Array) -> TimeStep:
         start_key, next_key = jax.random.split(key)
-        return begin(*start(start_key), next_key)
+        return begin(*start(start_key), next_key, unstable)
+
+    def reset(key: Array) -> TimeStep:
+        return fresh(key, jnp.asarray(none))
 
     def step(timestep: TimeStep, action: Array) -> TimeStep:
         episode: Episode = timestep.state
         task, obs, reward, terminated = advance(episode.task, jnp.clip(action, -1, 1))
         obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(reward, jnp.float32)
-        finite = jnp.isfinite(reward) & jnp.all(jnp.isfinite(obs))
+        finite = (jnp.abs(reward) < LARGEST) & jnp.all(jnp.abs(obs) < LARGEST)  # false for NaN too
         reward = jnp.where(finite, reward, 0)
         final_obs = jnp.where(finite, obs, timestep.obs)
         terminated = jnp.asarray(terminated, bool) | ~finite
         steps = episode.steps + 1
+        unstable = episode.unstable + (~finite).astype(jnp.int32)
         truncated = steps >= episode_length
 
-        fresh = reset(episode.key)
         ended = terminated | truncated
+        first = fresh(episode.key, unstable)
         state, obs = jax.tree.map(
             lambda new, old: jnp.where(ended, new, old),
-            (fresh.state, fresh.obs),
-            (Episode(task, steps, episode.key), final_obs),
+            (first.state, first.obs),
+            (Episode(task, steps, episode.key, unstable), final_obs),
         )
         return TimeStep(state, obs, reward, terminated, truncated, final_obs)
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:
         assert place is not None
-        return begin(*place(qpos, qvel), jax.random.key(0))
+        return begin(*place(qpos, qvel), jax.random.key(0), jnp.asarray(none))
 
-    return Environment(name, observation_size, action_size, episode_length, reset, step, set_physics if place else None)
+    def status(timestep: TimeStep) -> Metrics:
+        return {"unstable_steps": timestep.state.unstable}
+
+    given = set_physics if place else None
+    return Environment(name, observation_size, action_size, episode_length, reset, step, given, status)

@@ -1,15 +1,13 @@
-"""Gymnasium's locomotion tasks (its v4 generation), written once over `Physics`.
+"""Gymnasium's locomotion tasks, written once over `Physics`: starts, observations, rewards, termination.
 
-Source: gymnasium/envs/mujoco/{half_cheetah,walker2d,ant,humanoid}_v4.py, https://github.com/Farama-Foundation/Gymnasium.
 The models are the files in the installed gymnasium package. What differs: actions are in [-1, 1] and stretched to the
 actuators' range, numbers are float32, and the time limit belongs to the environment (`autoreset`).
 """
 
-from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,83 +15,40 @@ import mujoco
 import numpy as np
 
 from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.envs.gym_table import TASKS, Task
 from sqt_jax.envs.physics import Physics, PhysicsState, Setup, make_physics
 from sqt_jax.types import Array, Environment
 
 EPISODE_LENGTH = 1000  # Gymnasium's TimeLimit for all of them
 
 
-class Task(NamedTuple):
-    """One row of the table: what tells one locomotion task from another."""
-
-    gymnasium_id: str
-    xml: str  # a file among gymnasium's assets
-    frame_skip: int
-    ctrl_cost: float  # per squared unit of control
-    noise: float  # scale of the random start
-    normal_velocity: bool  # start velocities: normal with that scale, or uniform like the positions
-    tracked: Callable[[Any, Any], Any] | None = None  # the point whose speed along x is rewarded, as in `Setup`
-    hidden: int = 1  # leading entries of qpos left out of the observation (x, or x and y)
-    max_speed: float = float("inf")  # observed velocities are clipped to it
-    quantities: tuple[str, ...] = ()  # further fields that are observed, in this order
-    forward: float = 1.0  # reward per m/s
-    alive: float = 0.0  # reward per step, also for the one that terminates
-    healthy: Callable[[Array], Array] | None = None  # qpos -> bool; where false, the episode terminates
+# Leading entries of the quantities that belong to the world, or to the root (qfrc_actuator).
+WORLD_ENTRIES = {"cinert": 10, "cvel": 6, "qfrc_actuator": 6, "cfrc_ext": 6}
 
 
-def _torso(_: Any, data: Any) -> Any:
-    return data.xpos[1, 0]
-
-
-def _center_of_mass(model: Any, data: Any) -> Any:
-    return (model.body_mass * data.xipos[:, 0]).sum() / model.body_mass.sum()
-
-
-def _walker_healthy(qpos: Array) -> Array:
-    height, angle = qpos[1], qpos[2]
-    return (height > 0.8) & (height < 2.0) & (angle > -1.0) & (angle < 1.0)
-
-
-def _ant_healthy(qpos: Array) -> Array:
-    return (qpos[2] >= 0.2) & (qpos[2] <= 1.0)
-
-
-def _humanoid_healthy(qpos: Array) -> Array:
-    return (qpos[2] > 1.0) & (qpos[2] < 2.0)
-
-
-TASKS: dict[str, Task] = {
-    "cheetah": Task(
-        "HalfCheetah-v4", "half_cheetah.xml", 5, ctrl_cost=0.1, noise=0.1, normal_velocity=True
-    ),
-    "walker": Task(
-        "Walker2d-v4", "walker2d.xml", 4, ctrl_cost=1e-3, noise=5e-3, normal_velocity=False,
-        max_speed=10.0, alive=1.0, healthy=_walker_healthy,
-    ),
-    "ant": Task(
-        "Ant-v4", "ant.xml", 5, ctrl_cost=0.5, noise=0.1, normal_velocity=True,
-        tracked=_torso, hidden=2, alive=1.0, healthy=_ant_healthy,
-    ),
-    "humanoid": Task(
-        "Humanoid-v4", "humanoid.xml", 5, ctrl_cost=0.1, noise=1e-2, normal_velocity=False,
-        tracked=_center_of_mass, hidden=2, quantities=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
-        forward=1.25, alive=5.0, healthy=_humanoid_healthy,
-    ),
-}  # fmt: skip
-
-ALIASES = {"half_cheetah": "cheetah", "halfcheetah": "cheetah", "walker2d": "walker"}
+def forces(task: Task, state: PhysicsState) -> Array:
+    """External forces on all bodies as the task sees them, `[6 × bodies]`."""
+    return jnp.clip(state.quantities["cfrc_ext"], -task.force_limit, task.force_limit)
 
 
 def observe(task: Task, state: PhysicsState) -> Array:
     """The observation `[O]` of a physical state."""
     velocity = jnp.clip(state.qvel, -task.max_speed, task.max_speed)
-    return jnp.concatenate([state.qpos[task.hidden :], velocity, *(state.quantities[q] for q in task.quantities)])
+    parts = [state.qpos[task.hidden :], velocity]
+    for name in task.quantities:
+        quantity = forces(task, state) if name == "cfrc_ext" else state.quantities[name]
+        parts.append(quantity if task.observes_world else quantity[WORLD_ENTRIES[name] :])
+    return jnp.concatenate(parts)
 
 
-def reward(task: Task, state: PhysicsState, control: Array, control_step: float) -> Array:
+def reward(task: Task, state: PhysicsState, control: Array, control_step: float, terminated: Array) -> Array:
     """The reward `[]` of the control step of `control_step` seconds that led to `state`."""
-    speed = state.displacement / control_step
-    return task.forward * speed + task.alive - task.ctrl_cost * jnp.sum(jnp.square(control))
+    gain = task.forward * state.displacement / control_step + task.height * state.qpos[2]
+    alive = task.alive if task.alive_at_end else jnp.where(terminated, 0.0, task.alive)
+    cost = task.ctrl_cost * jnp.sum(jnp.square(control))
+    if task.contact_cost:
+        cost += jnp.minimum(task.contact_cost * jnp.sum(jnp.square(forces(task, state))), task.max_contact_cost)
+    return gain + alive - cost
 
 
 def draw_start(task: Task, qpos0: np.ndarray, num_velocities: int, key: Array) -> tuple[Array, Array]:
@@ -146,8 +101,8 @@ def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:
     def advance(state: PhysicsState, action: Array) -> tuple[PhysicsState, Array, Array, Array]:
         control = (low + high) / 2 + action * ((high - low) / 2)
         state = simulator.advance(state, control)
-        terminated = jnp.zeros((), bool) if task.healthy is None else ~task.healthy(state.qpos)
-        return state, observe(task, state), reward(task, state, control, control_step), terminated
+        terminated = jnp.zeros((), bool) if task.healthy is None else ~task.healthy(state.qpos, state.qvel)
+        return state, observe(task, state), reward(task, state, control, control_step, terminated), terminated
 
     observation_size = jax.eval_shape(start, jax.random.key(0))[1].size
     return make_environment(name, observation_size, model.nu, EPISODE_LENGTH, start, advance, place)

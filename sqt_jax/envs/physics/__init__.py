@@ -48,7 +48,7 @@ class Physics(NamedTuple):
 QUANTITIES = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 # name -> module with `make(setup, **options) -> Physics`, imported when first asked for
-PHYSICS = {"mjx": "sqt_jax.envs.physics.mjx"}
+PHYSICS = {"mjx": "sqt_jax.envs.physics.mjx", "mujoco": "sqt_jax.envs.physics.mujoco_c"}
 
 
 def make_physics(name: str, setup: Setup, **options: Any) -> Physics:

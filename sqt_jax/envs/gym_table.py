@@ -1,0 +1,145 @@
+"""The table of Gymnasium's locomotion tasks: what tells one from another, and their names.
+
+Source: gymnasium/envs/mujoco/*_v4.py and *_v5.py, https://github.com/Farama-Foundation/Gymnasium.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from sqt_jax.names import unknown
+from sqt_jax.types import Array
+
+INF = float("inf")
+
+
+class Task(NamedTuple):
+    """One row of the table. A step's reward is `forward` × speed + `height` × z + `alive` - the two costs."""
+
+    gymnasium_id: str
+    xml: str  # a file among gymnasium's assets
+    frame_skip: int
+    ctrl_cost: float  # per squared unit of control
+    noise: float  # scale of the random start
+    normal_velocity: bool = False  # start velocities: normal with that scale, or uniform like the positions
+    tracked: Callable[[Any, Any], Any] | None = None  # the point whose speed along x is rewarded, as in `Setup`
+    hidden: int = 1  # leading entries of qpos left out of the observation (x, or x and y)
+    max_speed: float = INF  # observed velocities are clipped to it
+    quantities: tuple[str, ...] = ()  # further fields that are observed, in this order
+    # v4 observes the world's (constant) entries of the quantities too, and the root's actuator forces.
+    observes_world: bool = True
+    forward: float = 1.0  # reward per m/s
+    height: float = 0.0  # reward per m of z
+    alive: float = 0.0  # reward per step
+    alive_at_end: bool = True  # also for the step that terminates, as in v4
+    contact_cost: float = 0.0  # per squared unit of external force
+    force_limit: float = INF  # each entry of the external forces is clipped to it, in observation and cost
+    max_contact_cost: float = INF
+    healthy: Callable[[Array, Array], Array] | None = None  # (qpos, qvel) -> bool; where false, the episode terminates
+
+
+def _torso(_: Any, data: Any) -> Any:
+    return data.xpos[1, 0]
+
+
+def _center_of_mass(model: Any, data: Any) -> Any:
+    return (model.body_mass * data.xipos[:, 0]).sum() / model.body_mass.sum()
+
+
+def _walker_healthy(qpos: Array, qvel: Array) -> Array:
+    del qvel
+    height, angle = qpos[1], qpos[2]
+    return (height > 0.8) & (height < 2.0) & (angle > -1.0) & (angle < 1.0)
+
+
+def _hopper_healthy(qpos: Array, qvel: Array) -> Array:
+    rest = jnp.concatenate([qpos[2:], qvel])
+    return (qpos[1] > 0.7) & (jnp.abs(qpos[2]) < 0.2) & jnp.all(jnp.abs(rest) < 100.0)
+
+
+def _ant_healthy(qpos: Array, qvel: Array) -> Array:
+    del qvel
+    return (qpos[2] >= 0.2) & (qpos[2] <= 1.0)
+
+
+def _humanoid_healthy(qpos: Array, qvel: Array) -> Array:
+    del qvel
+    return (qpos[2] > 1.0) & (qpos[2] < 2.0)
+
+
+BODY_QUANTITIES = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+
+V4 = {
+    "cheetah": Task(
+        "HalfCheetah-v4", "half_cheetah.xml", 5, ctrl_cost=0.1, noise=0.1, normal_velocity=True,
+    ),
+    "walker": Task(
+        "Walker2d-v4", "walker2d.xml", 4, ctrl_cost=1e-3, noise=5e-3,
+        max_speed=10.0, alive=1.0, healthy=_walker_healthy,
+    ),
+    "ant": Task(
+        "Ant-v4", "ant.xml", 5, ctrl_cost=0.5, noise=0.1, normal_velocity=True,
+        tracked=_torso, hidden=2, alive=1.0, healthy=_ant_healthy,
+    ),
+    "humanoid": Task(
+        "Humanoid-v4", "humanoid.xml", 5, ctrl_cost=0.1, noise=1e-2,
+        tracked=_center_of_mass, hidden=2, quantities=BODY_QUANTITIES,
+        forward=1.25, alive=5.0, healthy=_humanoid_healthy,
+    ),
+    "hopper": Task(
+        "Hopper-v4", "hopper.xml", 4, ctrl_cost=1e-3, noise=5e-3,
+        max_speed=10.0, alive=1.0, healthy=_hopper_healthy,
+    ),
+    "swimmer": Task(
+        "Swimmer-v4", "swimmer.xml", 4, ctrl_cost=1e-4, noise=0.1, hidden=2,
+    ),
+    # The height is divided by the simulator's time step of 0.003 s.
+    "humanoid_standup": Task(
+        "HumanoidStandup-v4", "humanoidstandup.xml", 5, ctrl_cost=0.1, noise=1e-2,
+        hidden=2, quantities=BODY_QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
+        contact_cost=5e-7, max_contact_cost=10.0,
+    ),
+}  # fmt: skip
+
+# Where Gymnasium's v5 differs from v4.
+V5: dict[str, dict[str, Any]] = {
+    "cheetah": {},
+    "walker": {"xml": "walker2d_v5.xml", "alive_at_end": False},
+    "ant": {
+        "alive_at_end": False, "quantities": ("cfrc_ext",), "observes_world": False,
+        "contact_cost": 5e-4, "force_limit": 1.0,
+    },
+    "humanoid": {"alive_at_end": False, "observes_world": False, "contact_cost": 5e-7, "max_contact_cost": 10.0},
+    "hopper": {"alive_at_end": False},
+    "swimmer": {},
+    "humanoid_standup": {"observes_world": False},
+}  # fmt: skip
+
+
+def _v5(name: str) -> Task:
+    return V4[name]._replace(gymnasium_id=V4[name].gymnasium_id.replace("-v4", "-v5"), **V5[name])
+
+
+TASKS: dict[str, Task] = V4 | {f"{name}-v5": _v5(name) for name in V4}
+
+ALIASES = {
+    "half_cheetah": "cheetah",
+    "halfcheetah": "cheetah",
+    "walker2d": "walker",
+    "humanoidstandup": "humanoid_standup",
+}
+
+
+def resolve(name: str) -> str:
+    """The table's name for a task's name, alias or Gymnasium id: `ant`, `ant-v5`, `walker2d`, `HalfCheetah-v4`.
+
+    Raises:
+      ValueError: the name is unknown; the message has the list of names and the nearest one.
+    """
+    base, dash, version = name.lower().partition("-v")
+    base = ALIASES.get(base, base)
+    found = base if dash + version in ("", "-v4") else f"{base}-v{version}"
+    if found not in TASKS:
+        raise ValueError(unknown(name, [*TASKS, *ALIASES]))
+    return found

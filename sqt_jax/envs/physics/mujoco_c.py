@@ -1,0 +1,214 @@
+"""MuJoCo's C library on the host, called from inside the compiled program: what Gymnasium computes, in float64.
+
+A control step of all robots of a program (members, environments) is one call: their states go out and come back as one
+array of 32-bit words each, and a few threads work them off. The call is pure: a robot's whole state (the solver's warm
+start included) is in what it is given, carried through JAX, which has no float64 here, as the bits of float64 numbers.
+"""
+
+import copy
+import itertools
+import os
+import queue
+import threading
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from sqt_jax.envs.physics import Physics, PhysicsState, Setup
+from sqt_jax.types import Array
+
+# What of MuJoCo's state goes in and comes out, in this order: qpos [nq], qvel [nv], qacc_warmstart [nv], ctrl [nu].
+STATE = (
+    mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_QVEL
+    | mujoco.mjtState.mjSTATE_WARMSTART
+    | mujoco.mjtState.mjSTATE_CTRL
+)
+
+
+def make(setup: Setup, num_threads: int | None = None) -> Physics:
+    """MuJoCo's C library.
+
+    Args:
+      num_threads: threads that step robots; None is one for each core that the process may use.
+
+    Raises:
+      ValueError: the model has activation states.
+    """
+    model = setup.model
+    if model.na:
+        raise ValueError(f"{model.na} activation states: only models with none")
+    stepper = Stepper(setup, num_threads or len(os.sched_getaffinity(0)))
+    num_places = model.nq + model.nv
+    # a header (0: just placed, the words are float32; 1: stepped, they are float64), x of the tracked point, STATE
+    state_words = 1 + 2 * (1 + num_places + model.nv)
+
+    def place(qpos: Array, qvel: Array) -> PhysicsState:
+        qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
+        words = _bits(jnp.concatenate([qpos, qvel]))
+        internal = jnp.zeros(state_words, jnp.uint32).at[1 : 1 + num_places].set(words)
+        quantities = _placed_quantities(setup, qpos, qvel)
+        return PhysicsState(qpos, qvel, jnp.zeros((), jnp.float32), quantities, internal)
+
+    def host(packed: np.ndarray) -> np.ndarray:
+        """Words of states and controls [..., W + nu] -> words of states and of the numbers `advance` takes apart."""
+        words = packed.reshape(-1, packed.shape[-1])
+        rows = np.empty((len(words), (state_words - 1) // 2 + model.nu))
+        rows[:, : -model.nu] = np.ascontiguousarray(words[:, 1:state_words]).view(np.float64)
+        rows[:, -model.nu :] = np.ascontiguousarray(words[:, state_words:]).view(np.float32)
+        fresh = words[:, 0] == 0
+        if fresh.any():
+            placed = np.ascontiguousarray(words[fresh, 1 : 1 + num_places]).view(np.float32)
+            rows[fresh, : -model.nu] = 0
+            rows[fresh, 0] = np.nan  # the stepper measures it
+            rows[fresh, 1 : 1 + num_places] = placed
+        measured = stepper(rows)
+        out = np.empty((len(words), state_words + measured.shape[1]), np.uint32)
+        out[:, 0] = 1
+        out[:, 1:state_words] = np.ascontiguousarray(rows[:, : -model.nu]).view(np.uint32)
+        out[:, state_words:] = measured.view(np.uint32)
+        return out.reshape(*packed.shape[:-1], -1)
+
+    def host_in_place(context: Any, out: Any, packed: Any) -> None:
+        del context
+        np.asarray(out)[...] = host(np.asarray(packed))
+
+    shape = jax.ShapeDtypeStruct((state_words + stepper.num_measured,), jnp.uint32)
+    # On CPU the buffers themselves, without a detour by JAX's arrays, which would cost 15 times the time and may
+    # deadlock (https://github.com/jax-ml/jax/issues/24255).
+    on_cpu = buffer_callback(host_in_place, shape, vmap_method="broadcast_all")
+
+    def elsewhere(packed: Array) -> Array:
+        return jax.pure_callback(lambda words: host(np.asarray(words)), shape, packed, vmap_method="broadcast_all")
+
+    def advance(state: PhysicsState, control: Array) -> PhysicsState:
+        packed = jnp.concatenate([state.internal, _bits(jnp.asarray(control, jnp.float32))])
+        out = jax.lax.platform_dependent(packed, cpu=on_cpu, default=elsewhere)
+        measured = jax.lax.bitcast_convert_type(out[state_words:], jnp.float32)
+        qpos, qvel, displacement, *quantities = jnp.split(measured, stepper.splits)
+        return PhysicsState(
+            qpos, qvel, displacement[0], dict(zip(setup.quantities, quantities, strict=True)), out[:state_words]
+        )
+
+    return Physics(place, advance)
+
+
+class Stepper:
+    """A control step of many robots, on several threads. NumPy only: nothing of JAX may run inside a callback."""
+
+    def __init__(self, setup: Setup, num_threads: int):
+        self.setup = setup
+        self.num_threads = num_threads
+        self.model = copy.copy(setup.model)
+        # A diverged robot is told by its numbers; MuJoCo would put it back to the start and go on.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        mujoco.set_mju_user_warning(_be_quiet)  # else MuJoCo writes of it into a file in the current directory
+        self.data = [mujoco.MjData(self.model) for _ in range(num_threads)]
+        sizes = [self.model.nq, self.model.nv, 1] + [getattr(self.data[0], name).size for name in setup.quantities]
+        self.num_measured = sum(sizes)
+        self.splits = np.cumsum(sizes)[:-1].tolist()
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Steps `rows` [R, 1 + nq + 2 nv + nu] (x of the tracked point, then STATE) in place.
+
+        Returns:
+          [R, F] float32: qpos, qvel, the tracked point's displacement, the quantities; NaN where the robot diverged.
+        """
+        measured = np.empty((len(rows), self.num_measured), np.float32)
+        displacement, first_quantity = self.splits[1], self.splits[1] + 1
+        numbers = itertools.count()  # of the next row that no thread has taken; its steps are atomic
+
+        def work(thread: int) -> None:
+            model, data = self.model, self.data[thread]
+            for i in numbers:
+                if i >= len(rows):
+                    return
+                row = rows[i]
+                mujoco.mj_setState(model, data, row[1:], STATE)
+                before = row[0]
+                if np.isnan(before):
+                    mujoco.mj_kinematics(model, data)
+                    mujoco.mj_comPos(model, data)
+                    before = self.tracked(data)
+                mujoco.mj_step(model, data, nstep=self.setup.frame_skip)
+                mujoco.mj_getState(model, data, row[1:], STATE)
+                row[0] = self.tracked(data)
+                measured[i, displacement] = row[0] - before
+                if self.setup.quantities:
+                    if "cfrc_ext" in self.setup.quantities:
+                        mujoco.mj_rnePostConstraint(model, data)
+                    fields = [getattr(data, name).ravel() for name in self.setup.quantities]
+                    measured[i, first_quantity:] = np.concatenate(fields)
+
+        _threads(self.num_threads).run(work, min(self.num_threads, len(rows)))
+        with np.errstate(over="ignore"):
+            measured[:, :displacement] = rows[:, 1 : 1 + displacement]
+        stable = np.all(np.abs(rows) < mujoco.mjMAXVAL, axis=1)
+        measured[~stable] = np.nan
+        return measured
+
+    def tracked(self, data: mujoco.MjData) -> float:
+        return data.qpos[0] if self.setup.tracked is None else self.setup.tracked(self.model, data)
+
+
+class _Threads:
+    """The caller and a few threads beside it that wait for work: one call at a time."""
+
+    def __init__(self, num_threads: int):
+        self.lock = threading.Lock()
+        self.todo: list[queue.SimpleQueue] = [queue.SimpleQueue() for _ in range(num_threads - 1)]
+        self.done: queue.SimpleQueue = queue.SimpleQueue()
+        for number, todo in enumerate(self.todo, start=1):
+            threading.Thread(target=self._serve, args=(number, todo), daemon=True, name=f"mujoco-{number}").start()
+
+    def _serve(self, number: int, todo: queue.SimpleQueue) -> None:
+        while True:
+            self.done.put(_error_of(todo.get(), number))
+
+    def run(self, work: Callable[[int], None], num_threads: int) -> None:
+        """Runs `work(0)` here, `work(1)`.. beside it; raises the first of their errors when all have ended."""
+        with self.lock:
+            helpers = self.todo[: num_threads - 1]
+            for todo in helpers:
+                todo.put(work)
+            errors = [_error_of(work, 0), *(self.done.get() for _ in helpers)]
+        for error in errors:
+            if error is not None:
+                raise error
+
+
+def _error_of(work: Callable[[int], None], number: int) -> BaseException | None:
+    try:
+        work(number)
+    except BaseException as error:
+        return error
+    return None
+
+
+@cache
+def _threads(num_threads: int) -> _Threads:
+    return _Threads(num_threads)
+
+
+def _be_quiet(message: str) -> None:
+    del message
+
+
+def _bits(x: Array) -> Array:
+    return jax.lax.bitcast_convert_type(x, jnp.uint32)
+
+
+def _placed_quantities(setup: Setup, qpos: Array, qvel: Array) -> dict[str, Array]:
+    """The quantities of a robot that was just placed. By MJX: a call to the host for every possible start would cost
+    more than the few kinematics of it, which are exact to float32."""
+    if not setup.quantities:
+        return {}
+    from sqt_jax.envs.physics import mjx
+
+    return mjx.make(setup).place(qpos, qvel).quantities
