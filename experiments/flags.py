@@ -172,7 +172,7 @@ FLAGS: dict[str, list[_Flag]] = {
             str,
             "a name",
             "environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's v4); "
-            "NAME-v5 for its v5",
+            "NAME-v5 for its v5; brax:ant and others for Brax's own",
             "required",
         ),
         *_settings(Config),

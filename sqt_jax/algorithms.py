@@ -144,10 +144,11 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
         env = envs.resolve(env)
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
-    if physics not in envs.PHYSICS:
-        raise ConfigError("physics", unknown(physics, envs.PHYSICS))
-    if eval_physics != "auto" and eval_physics not in envs.PHYSICS:
-        raise ConfigError("eval_physics", unknown(eval_physics, ["auto", *envs.PHYSICS]))
+    known = envs.simulators(env)
+    if physics not in known:
+        raise ConfigError("physics", f"{unknown(physics, known)} for {env}")
+    if eval_physics not in ("auto", *known):
+        raise ConfigError("eval_physics", f"{unknown(eval_physics, ['auto', *known])} for {env}")
     train_config = TrainConfig(**{**ALGORITHMS[algo].training, **training})
     check_train(train_config)
     if ALGORITHMS[algo].assessed and train_config.num_envs > 1:
@@ -196,7 +197,8 @@ def eval_physics_of(config: Config) -> str:
     """The physics that evaluation plays on: with `auto`, MuJoCo C where it is the faster one."""
     if config.eval_physics != "auto":
         return config.eval_physics
-    return "mujoco" if jax.default_backend() == "cpu" else config.physics
+    faster = jax.default_backend() == "cpu" and "mujoco" in envs.simulators(config.env)
+    return "mujoco" if faster else config.physics
 
 
 def make_train(config: Config, env: Environment | None = None) -> Callable[..., tuple[train.TrainState, train.History]]:

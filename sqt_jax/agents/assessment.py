@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from sqt_jax.config import AgentConfig
+from sqt_jax.rarely import rarely
 from sqt_jax.types import Array, Metrics, Params
 
 # The smallest return of no episodes: finite, so that what is not finite in an agent's state tells of divergence.
@@ -52,12 +53,15 @@ def assess(
     better = ~worse & (episodes >= jnp.where(late, config.assessment_episodes, 1))
     over, better = ended & (worse | better), ended & better
 
-    def select(condition, new, old):
-        return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    def refresh(policies: tuple[Params, Params], given: tuple[Params, Array]) -> tuple[Params, Params]:
+        (snapshot, checkpoint), (learner, better) = policies, given
+        return learner, jax.tree.map(lambda a, b: jnp.where(better, a, b), snapshot, checkpoint)
 
+    # Whole networks, and once in an episode: not worth a selection at each step.
+    snapshot, checkpoint = rarely(over, refresh, (state.snapshot, state.checkpoint), given=(learner, better))
     return Checkpoints(
-        snapshot=select(over, learner, state.snapshot),
-        checkpoint=select(better, state.snapshot, state.checkpoint),
+        snapshot=snapshot,
+        checkpoint=checkpoint,
         best_min_return=jnp.where(better, min_return, state.best_min_return),
         min_return=jnp.where(over, NONE, jnp.where(ended, min_return, state.min_return)),
         episodes=jnp.where(over, 0, jnp.where(ended, episodes, state.episodes)),

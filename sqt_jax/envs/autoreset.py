@@ -15,12 +15,13 @@ The contract (one test per sentence in tests/test_envs.py):
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sqt_jax.rarely import rarely
 from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
 
 LARGEST = 1e10  # MuJoCo's own limit (mjMAXVAL): beyond it, a simulation has diverged
@@ -51,8 +52,8 @@ def make_environment(
     """Make an `Environment` out of a task that knows nothing of episodes.
 
     Args:
-      start: `key -> (state, obs [O])`, a random start. It runs at every step (under `vmap` both branches of a
-        condition do), so it should be cheap.
+      start: `key -> (state, obs [O])`, a random start. Under `vmap` it runs for all at each step at which any episode
+        ends.
       advance: `(state, action [A] in [-1, 1]) -> (state, obs [O], reward [], terminated [] bool)`, one step.
       place: `(qpos, qvel) -> (state, obs [O])`, a given physical state; gives `Environment.set_physics`, whose
         episodes to come start from a fixed key.
@@ -73,6 +74,11 @@ def make_environment(
     def reset(key: Array) -> TimeStep:
         return fresh(key, jnp.asarray(none))
 
+    def restart(old: tuple[Episode, Array], _: Any) -> tuple[State, Array]:
+        episode, _ = old
+        first = fresh(episode.key, episode.unstable)
+        return first.state, first.obs
+
     def step(timestep: TimeStep, action: Array) -> TimeStep:
         episode: Episode = timestep.state
         task, obs, reward, terminated = advance(episode.task, jnp.clip(action, -1, 1))
@@ -86,12 +92,7 @@ def make_environment(
         truncated = steps >= episode_length
 
         ended = terminated | truncated
-        first = fresh(episode.key, unstable)
-        state, obs = jax.tree.map(
-            lambda new, old: jnp.where(ended, new, old),
-            (first.state, first.obs),
-            (Episode(task, steps, episode.key, unstable), final_obs),
-        )
+        state, obs = rarely(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
         return TimeStep(state, obs, reward, terminated, truncated, final_obs)
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:

@@ -1,0 +1,82 @@
+"""Brax's environments through our contract: the same steps, new starts, the true last observation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sqt_jax import envs
+from sqt_jax.envs.brax_envs import NAMES, PIPELINES
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Brax's own
+NAME = "brax:inverted_pendulum"  # the smallest: it compiles in seconds
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    env = envs.make(NAME, "spring")
+    return env, jax.jit(env.step)
+
+
+def test_the_names_are_braxs_but_for_its_test_environment():
+    from brax import envs as theirs
+
+    assert {name.removeprefix("brax:") for name in NAMES} == set(theirs._envs) - {"fast"}
+
+
+def test_steps_are_braxs(pendulum):
+    from brax import envs as theirs
+
+    env, step = pendulum
+    original = theirs.get_environment("inverted_pendulum", backend="spring")
+    timestep = env.reset(jax.random.key(3))
+    state = timestep.state.task
+    np.testing.assert_array_equal(timestep.obs, state.obs)
+    their_step = jax.jit(original.step)
+    for action in (0.3, -0.2, 0.1):
+        timestep, state = step(timestep, jnp.full(1, action)), their_step(state, jnp.full(1, action))
+        np.testing.assert_allclose(timestep.final_obs, state.obs, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(timestep.reward, state.reward, rtol=1e-6)
+
+
+def test_an_episode_ends_with_its_own_observation_and_goes_on_from_a_new_start(pendulum):
+    env, step = pendulum
+    timestep = env.reset(jax.random.key(0))
+    starts = [timestep.obs]
+    for _ in range(300):
+        timestep = step(timestep, jnp.ones(1))
+        if timestep.terminated:
+            assert abs(timestep.final_obs[1]) > 0.2  # the fallen pole
+            starts.append(timestep.obs)
+        else:
+            np.testing.assert_array_equal(timestep.final_obs, timestep.obs)
+    assert len(starts) >= 3
+    assert len(np.unique(np.array(starts), axis=0)) == len(starts)
+    assert np.abs(np.array(starts)).max() <= 0.05
+
+
+def test_the_time_limit_truncates(pendulum):
+    env, step = pendulum
+    timestep = env.reset(jax.random.key(0))
+    late = timestep._replace(state=timestep.state._replace(steps=jnp.int32(999)))
+    assert step(late, jnp.zeros(1)).truncated and not step(timestep, jnp.zeros(1)).truncated
+
+
+@pytest.mark.parametrize("physics", [name for name in PIPELINES if name != "mujoco"])
+def test_every_pipeline_has_the_same_sizes(physics):
+    env = envs.make(NAME, physics)
+    assert (env.observation_size, env.action_size, env.name) == (4, 1, NAME)
+
+
+@pytest.mark.parametrize(
+    ("name", "physics", "message"),
+    [
+        ("brax:ant", "mujoco", "physics takes one of mjx, generalized, spring, positional, not 'mujoco'"),
+        ("ant", "spring", "physics takes one of mjx, mujoco, not 'spring'"),
+        ("brax:antt", "mjx", "not 'brax:antt'; did you mean brax:ant?"),
+    ],
+)
+def test_what_brax_has_not_is_refused(name, physics, message):
+    with pytest.raises(ValueError) as error:
+        envs.make(name, physics)
+    assert message in str(error.value)

@@ -1,0 +1,88 @@
+"""A branch for few steps: the same as a selection, under any nesting of vmap, and not run where nothing asks for it."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sqt_jax.rarely import rarely
+
+
+def branch(old, given):
+    a, b = old
+    return a * given, b - 1
+
+
+def step(predicate, old, given):
+    return rarely(predicate, branch, old, given=given)
+
+
+def selected(predicate, old, given):
+    return jax.tree.map(lambda a, b: jnp.where(predicate, a, b), branch(old, given), old)
+
+
+def arguments(*shape):
+    generator = np.random.default_rng(0)
+    old = (jnp.float32(generator.normal(size=(*shape, 3))), jnp.arange(np.prod(shape, dtype=int)).reshape(shape))
+    return jnp.asarray(generator.random(shape) < 0.4), old, jnp.float32(generator.normal(size=(*shape, 1)))
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (4, 3), (2, 3, 2)])
+def test_it_is_a_selection_under_any_nesting_of_vmap(shape, maybe_jit):
+    ours, expected = step, selected
+    for _ in shape:
+        ours, expected = jax.vmap(ours), jax.vmap(expected)
+    args = arguments(*shape)
+    assert same(maybe_jit(ours)(*args), expected(*args))
+    for value in (True, False):
+        everywhere = (jnp.full(shape, value), *args[1:])
+        assert same(maybe_jit(ours)(*everywhere), expected(*everywhere))
+
+
+def test_what_is_not_batched_is_shared():
+    predicate, old, given = arguments(6)
+    one = jax.tree.map(lambda leaf: leaf[0], old)
+    assert same(
+        jax.vmap(step, (0, None, None))(predicate, one, given[0]),
+        jax.vmap(selected, (0, None, None))(predicate, one, given[0]),
+    )
+    assert same(
+        jax.vmap(step, (None, 0, 0))(jnp.array(True), old, given),
+        jax.vmap(selected, (None, 0, 0))(jnp.array(True), old, given),
+    )
+
+
+def test_the_branch_is_one_in_the_compiled_loop():
+    """A conditional, and outside of it no selection of the state."""
+
+    def loop(old, given):
+        def body(i, old):
+            return jax.vmap(jax.vmap(lambda old, given: step(i + given[0] > 100, old, given)))(old, given)
+
+        return jax.lax.fori_loop(0, 10, body, old)
+
+    _, old, given = arguments(4, 3)
+    text = jax.jit(loop).lower(old, given).compile().as_text()
+    assert len(re.findall(r" conditional\(", text)) == 1
+
+
+def test_the_branch_runs_only_where_it_is_asked_for():
+    runs = []
+
+    def counted(old, given):
+        jax.debug.callback(lambda: runs.append(1))
+        return old + 1
+
+    def at(predicate):
+        out = jax.jit(jax.vmap(lambda p, old: rarely(p, counted, old)))(predicate, jnp.zeros(4))
+        jax.effects_barrier()
+        return out.tolist()
+
+    assert at(jnp.zeros(4, bool)) == [0, 0, 0, 0] and not runs
+    assert at(jnp.arange(4) == 2) == [0, 0, 1, 0] and runs
