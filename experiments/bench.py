@@ -7,6 +7,7 @@ machine's speed changes with what else it does.
 
 import dataclasses
 import functools
+import itertools
 import json
 import platform
 import statistics
@@ -30,7 +31,9 @@ SUITES = ("env", "update", "replay", "loop")
 BATCH = 256
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
-flags.DEFINE_list("tasks", list(envs.TASKS), "Tasks; the suite replay takes the rows of the first one.")
+PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
+flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
+flags.DEFINE_list("physics", list(envs.PHYSICS), "Physics of the suites env and loop.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
@@ -71,9 +74,9 @@ def member_keys(members: int) -> Array:
     return jax.vmap(jax.random.key)(jnp.arange(members))
 
 
-def bench_env(task: str, members: int, **timing: Any) -> Row:
+def bench_env(task: str, members: int, physics: str, **timing: Any) -> Row:
     """Environment steps with random actions, automatic restarts included."""
-    env = envs.make(task)
+    env = envs.make(task, physics)
 
     def step(timestep, key):
         def policy(_):
@@ -91,7 +94,7 @@ def bench_env(task: str, members: int, **timing: Any) -> Row:
     keys = member_keys(members)
     start = jax.jit(jax.vmap(lambda key: rollout.reset(env, key, 1)))(keys)
     rate, compile_seconds = measure(lambda steps: run(start, keys, steps), **timing)
-    return Row("env", task, members, "env steps", rate * members, compile_seconds)
+    return Row("env", f"{task}, {physics}", members, "env steps", rate * members, compile_seconds)
 
 
 def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
@@ -170,9 +173,9 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
     return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
 
 
-def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
+def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) -> Row:
     """The whole training loop: environment step, insert, sample, update."""
-    config = algorithms.make_config(algo, task, replay_capacity=100_000)
+    config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
     sweep = train.make_sweep(algorithms.make_trainer(config))
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
@@ -187,12 +190,12 @@ def bench_loop(algo: str, task: str, members: int, **timing: Any) -> Row:
         return metrics
 
     rate, _ = measure(once, **timing)
-    return Row("loop", f"{algo} on {task}", members, "env steps", rate * members, compile_seconds)
+    return Row("loop", f"{algo} on {task}, {physics}", members, "env steps", rate * members, compile_seconds)
 
 
 def check_flags() -> None:
     """Leaves with one line that names the first flag with a value that cannot be."""
-    known = {"suites": SUITES, "tasks": envs.TASKS, "algos": algorithms.ALGORITHMS}
+    known = {"suites": SUITES, "tasks": envs.TASKS, "algos": algorithms.ALGORITHMS, "physics": envs.PHYSICS}
     for name, values in known.items():
         for value in getattr(FLAGS, name):
             if value not in values:
@@ -204,12 +207,12 @@ def check_flags() -> None:
 
 
 def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
-    tasks, algos = FLAGS.tasks, FLAGS.algos
+    tasks, algos, physics = FLAGS.tasks, FLAGS.algos, FLAGS.physics
     members = [int(value) for value in FLAGS.members]
     for suite in suites:
         for count in members:
             if suite == "env":
-                yield from (bench_env(task, count, **timing) for task in tasks)
+                yield from (bench_env(task, count, name, **timing) for task in tasks for name in physics)
             elif suite == "update":
                 yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
             elif suite == "replay":
@@ -220,7 +223,8 @@ def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
                     for size in FLAGS.capacities
                 )
             elif suite == "loop":
-                yield from (bench_loop(algo, task, count, **timing) for algo in algos for task in tasks)
+                cases = itertools.product(algos, tasks, physics)
+                yield from (bench_loop(algo, task, count, name, **timing) for algo, task, name in cases)
 
 
 def machine() -> dict[str, Any]:

@@ -4,6 +4,7 @@ from sqt_jax import q_targets
 from sqt_jax.algorithms import ALGORITHMS, make_agent, make_config, make_train, make_trainer
 from sqt_jax.config import Config, ConfigError
 from sqt_jax.envs import make as make_env
+from sqt_jax.evaluate import evaluate_policy
 from sqt_jax.policy import load_policy, save_policy
 from sqt_jax.train import make_sweep
 from sqt_jax.types import Agent, Environment, Replay, Scalars, TimeStep, Transition
@@ -18,6 +19,7 @@ __all__ = [
     "Scalars",
     "TimeStep",
     "Transition",
+    "evaluate_policy",
     "load_policy",
     "make_agent",
     "make_config",

@@ -57,7 +57,14 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("flag", "value"),
-    [("suites", "updates"), ("tasks", "hopper2"), ("algos", "td8"), ("members", "0"), ("capacities", "x")],
+    [
+        ("suites", "all"),
+        ("tasks", "hopper2"),
+        ("algos", "td8"),
+        ("physics", "x"),
+        ("members", "0"),
+        ("capacities", "x"),
+    ],
 )
 def test_a_wrong_name_is_told_in_one_line_before_anything_runs(flag, value):
     bench.FLAGS.mark_as_parsed()

@@ -1,13 +1,15 @@
 """Evaluation: each episode to its own end, from fresh starts, under the given policy."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from probe_envs import constant_reward, countdown, one_step
 
-from sqt_jax import rollout
+from sqt_jax import envs, rollout
 from sqt_jax.envs.autoreset import make_environment
-from sqt_jax.evaluate import evaluate
+from sqt_jax.evaluate import evaluate, evaluate_policy
 
 KEY = jax.random.key(0)
 
@@ -80,3 +82,43 @@ def test_members_evaluate_side_by_side_as_they_do_alone():
     for i in range(3):
         np.testing.assert_array_equal(together.lengths[i], alone(keys[i]).lengths)
         np.testing.assert_array_equal(together.returns[i], alone(keys[i]).returns)
+
+
+def test_a_policy_is_worth_the_same_in_gymnasiums_environment_and_in_ours():
+    """A policy under which the hopper falls at once, whatever the start: lengths and returns lie close together."""
+    import gymnasium
+
+    weights = 0.3 * jax.random.normal(jax.random.key(1), (11, 3))
+
+    def policy(obs):
+        return jnp.tanh(obs @ weights)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        theirs = evaluate_policy(policy, gymnasium.make("Hopper-v4"), num_episodes=10)
+    ours = evaluate_policy(policy, envs.make("hopper", "mujoco"), num_episodes=10)
+    assert min(theirs[1].min(), ours[1].min()) > 5
+    for their, our in zip(theirs, ours, strict=True):
+        assert their.shape == our.shape == (10,)
+        assert abs(their.mean() - our.mean()) < 3 * max(their.std(), our.std(), 1.0)
+
+
+class Ladder:
+    """In Gymnasium's form: reward is the action as the environment sees it, 3 steps, actions from 0 to 10."""
+
+    class action_space:
+        low, high = np.zeros(1, np.float32), np.full(1, 10, np.float32)
+
+    def reset(self, seed):
+        self.steps = 0
+        return np.array([float(seed)]), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(1), float(action[0]), False, self.steps == 3, {}
+
+
+def test_actions_are_stretched_to_gymnasiums_action_space():
+    returns, lengths = evaluate_policy(lambda obs: jnp.clip(obs[:, :1], -1, 1), Ladder(), num_episodes=2, seed=0)
+    np.testing.assert_allclose(returns, [15, 20])  # obs 0, then 0 and 0: 5 each; obs 1: 10, then 5 and 5
+    np.testing.assert_array_equal(lengths, [3, 3])

@@ -7,8 +7,9 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from gym_reference import MJX_TASKS, environment, episode, gymnasium_environment, ours, recorded
+from gym_reference import MJX_TASKS, environment, ours, recorded
 
+from experiments.gymnasium_reference import episode, gymnasium_environment
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 

@@ -121,6 +121,7 @@ def test_the_state_is_carried_in_float64(ant):
 def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     env = envs.make("ant", "mujoco")
+    gym_tasks.load_model(TASKS["cheetah"])  # which lets MuJoCo speak again
     timestep = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
     qvel = timestep.state.task.qvel.at[1, 2].set(fault)
     broken = jax.vmap(env.set_physics)(timestep.state.task.qpos, qvel)

@@ -108,7 +108,6 @@ class Stepper:
         self.model = copy.copy(setup.model)
         # A diverged robot is told by its numbers; MuJoCo would put it back to the start and go on.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        mujoco.set_mju_user_warning(_be_quiet)  # else MuJoCo writes of it into a file in the current directory
         self.data = [mujoco.MjData(self.model) for _ in range(num_threads)]
         sizes = [self.model.nq, self.model.nv, 1] + [getattr(self.data[0], name).size for name in setup.quantities]
         self.num_measured = sum(sizes)
@@ -120,6 +119,9 @@ class Stepper:
         Returns:
           [R, F] float32: qpos, qvel, the tracked point's displacement, the quantities; NaN where the robot diverged.
         """
+        # Else MuJoCo writes of diverged robots into a file in the current directory. At each step, since whoever loads
+        # a model or makes a Gymnasium environment may have set it otherwise.
+        mujoco.set_mju_user_warning(_be_quiet)
         measured = np.empty((len(rows), self.num_measured), np.float32)
         displacement, first_quantity = self.splits[1], self.splits[1] + 1
         numbers = itertools.count()  # of the next row that no thread has taken; its steps are atomic

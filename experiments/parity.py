@@ -1,0 +1,177 @@
+"""How near our environments are to Gymnasium's: `python -m experiments.parity --out=parity.md`.
+
+For each task and version: whole episodes on MuJoCo C against Gymnasium's own environment, single control steps of each
+physics from the same states, and the speed of five environments side by side. The benchmark's flags --tasks,
+--physics, --seconds and --repeats are understood.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from absl import app, flags, logging
+
+from experiments import runtime
+from experiments.bench import bench_env, check_flags, machine
+from experiments.gymnasium_reference import Episode, episode, recorded
+from sqt_jax import envs
+from sqt_jax.envs import TASKS
+from sqt_jax.types import Environment
+
+FLAGS = flags.FLAGS
+flags.DEFINE_integer("states", 256, "States from which a step is compared.", lower_bound=16)
+flags.DEFINE_string("out", "", "The report's file; it is printed in any case.")
+
+MEMBERS = 5  # environments side by side in the timing
+
+# Starts and sizes of the random actions of the compared episodes.
+EPISODES = ((0, 1.0), (1, 0.3), (2, 0.05))
+
+
+class WholeEpisodes(NamedTuple):
+    """Largest |ours - theirs| / (1 + |theirs|) along the episodes."""
+
+    steps: int
+    obs: float
+    reward: float
+    terminations_agree: bool
+
+
+class Steps(NamedTuple):
+    """One control step; errors of a state are those of its worst entry."""
+
+    qvel_median: float
+    qvel_95: float
+    obs_median: float
+    reward_median: float
+    reward_95: float
+    terminations_agree: float  # share of the states
+
+
+def compare_episodes(env: Environment, episodes: Sequence[Episode]) -> WholeEpisodes:
+    """Plays the episodes' actions from the episodes' starts."""
+    longest = max(len(theirs.actions) for theirs in episodes)
+
+    @jax.jit
+    def play(start, actions):
+        def step(timestep, action):
+            timestep = env.step(timestep, action)
+            return timestep, (timestep.final_obs, timestep.reward, timestep.terminated)
+
+        return jax.lax.scan(step, start, actions)[1]
+
+    steps, obs_error, reward_error, agree = 0, 0.0, 0.0, True
+    for theirs in episodes:
+        length = len(theirs.actions)
+        actions = np.zeros((longest, env.action_size), np.float32)
+        actions[:length] = theirs.actions
+        assert env.set_physics is not None
+        ours = play(env.set_physics(jnp.asarray(theirs.qpos), jnp.asarray(theirs.qvel)), actions)
+        obs, reward, terminated = (np.asarray(leaf)[:length] for leaf in ours)
+        steps += length
+        obs_error = max(obs_error, _relative(obs, theirs.obs))
+        reward_error = max(reward_error, _relative(reward, theirs.reward))
+        agree &= np.array_equal(terminated, theirs.terminated)
+    return WholeEpisodes(steps, obs_error, reward_error, agree)
+
+
+def compare_steps(name: str, env: Environment, count: int) -> Steps:
+    """One step from `count` states of Gymnasium's own rollouts."""
+    rows = recorded(name, count)
+    assert env.set_physics is not None
+    placed = jax.jit(jax.vmap(env.set_physics))(jnp.asarray(rows.qpos), jnp.asarray(rows.qvel))
+    after = jax.jit(jax.vmap(env.step))(placed, rows.action)
+    task = TASKS[name]
+    first = rows.qpos.shape[1] - task.hidden
+    velocities = slice(first, first + rows.qvel.shape[1])
+    obs = np.asarray(after.final_obs, np.float64)
+    expected = np.clip(rows.next_qvel, -task.max_speed, task.max_speed)
+    qvel_error = np.abs(obs[:, velocities] - expected).max(axis=1)
+    reward_error = np.abs(np.asarray(after.reward, np.float64) - rows.reward)
+    obs_error = np.abs(obs - rows.obs).max(axis=1) / (1 + np.abs(rows.obs).max(axis=1))
+    return Steps(
+        qvel_median=float(np.median(qvel_error)),
+        qvel_95=float(np.quantile(qvel_error, 0.95)),
+        obs_median=float(np.median(obs_error)),
+        reward_median=float(np.median(reward_error)),
+        reward_95=float(np.quantile(reward_error, 0.95)),
+        terminations_agree=float(np.mean(np.asarray(after.terminated) == rows.terminated)),
+    )
+
+
+def _relative(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
+
+
+def episode_table(found: dict[str, WholeEpisodes]) -> list[str]:
+    lines = ["| task | steps | observation | reward | terminations |", "|---|---|---|---|---|"]
+    for name, row in found.items():
+        agree = "equal" if row.terminations_agree else "DIFFER"
+        lines.append(f"| {TASKS[name].gymnasium_id} | {row.steps:,} | {row.obs:.1e} | {row.reward:.1e} | {agree} |")
+    return lines
+
+
+def step_table(found: dict[tuple[str, str], tuple[Steps, float]]) -> list[str]:
+    head = "| task | physics | qvel median | qvel 95 % | observation median | reward median | reward 95 % "
+    lines = [head + "| terminations equal | env steps/s |", "|---|---|---|---|---|---|---|---|---|"]
+    for (name, physics), (row, speed) in found.items():
+        numbers = " | ".join(f"{value:.1e}" for value in row[:5])
+        share = f"{100 * row.terminations_agree:.1f} %"
+        lines.append(f"| {TASKS[name].gymnasium_id} | {physics} | {numbers} | {share} | {speed:,.0f} |")
+    return lines
+
+
+def report(episodes: dict[str, WholeEpisodes], steps: dict[tuple[str, str], tuple[Steps, float]], command: str) -> str:
+    about = ", ".join(f"{key}: {value}" for key, value in machine().items())
+    return "\n".join(
+        [
+            "# Parity with Gymnasium",
+            "",
+            f"By `{command}`. {about}.",
+            "",
+            "## Whole episodes on `mujoco`",
+            "",
+            "Random actions of three sizes until the episode ends; the largest |ours - theirs| / (1 + |theirs|).",
+            "",
+            *episode_table(episodes),
+            "",
+            "## One control step",
+            "",
+            f"From {FLAGS.states} states of Gymnasium's random rollouts, the solver not warm-started. qvel in rad/s or",
+            "m/s, the worst entry of each state; observation: the worst entry against the state's largest. The speed",
+            f"is that of {MEMBERS} environments side by side with random actions, restarts included.",
+            "",
+            *step_table(steps),
+            "",
+        ]
+    )
+
+
+def main(argv: Sequence[str]) -> None:
+    del argv  # what absl leaves of it: no flags
+    check_flags()
+    logging.set_verbosity(logging.WARNING)
+    runtime.prepare()
+    episodes: dict[str, WholeEpisodes] = {}
+    steps: dict[tuple[str, str], tuple[Steps, float]] = {}
+    for name in FLAGS.tasks:
+        for physics in FLAGS.physics:
+            print(f"{name} on {physics} ...", file=sys.stderr, flush=True)
+            env = envs.make(name, physics)
+            if physics == "mujoco":
+                episodes[name] = compare_episodes(env, [episode(name, *case) for case in EPISODES])
+            row = bench_env(name, MEMBERS, physics, seconds=FLAGS.seconds, repeats=FLAGS.repeats)
+            steps[name, physics] = compare_steps(name, env, FLAGS.states), row.rate
+    text = report(episodes, steps, " ".join(["python -m experiments.parity", *sys.argv[1:]]))
+    print(text)
+    if FLAGS.out:
+        Path(FLAGS.out).write_text(text)
+
+
+if __name__ == "__main__":
+    FLAGS.set_default("tasks", list(TASKS))  # the flag is the benchmark's
+    app.run(main)
