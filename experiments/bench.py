@@ -180,14 +180,14 @@ def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) 
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
     start = time.perf_counter()
-    state, _ = jax.block_until_ready(sweep.advance(state, 1, False))
+    state = jax.block_until_ready(sweep.advance(state, 1, False))
     compile_seconds = time.perf_counter() - start
-    state, _ = sweep.advance(state, 299, False)
+    state = sweep.advance(state, 299, False)
 
     def once(steps):
         nonlocal state
-        state, metrics = sweep.advance(state, steps, True)
-        return metrics
+        state = sweep.advance(state, steps, True)
+        return state.env_steps
 
     rate, _ = measure(once, **timing)
     return Row("loop", f"{algo} on {task}, {physics}", members, "env steps", rate * members, compile_seconds)

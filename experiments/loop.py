@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.progress import Display, Status, eta_seconds
 from sqt_jax.config import TrainConfig
-from sqt_jax.train import Sweep, TrainState, evaluation_steps
+from sqt_jax.train import Sweep, TrainState, evaluation_steps, new_interval
 
 # How long one call into the compiled program may take: the display and Ctrl-C wait for it.
 CHUNK_SECONDS = 2.0
@@ -86,35 +86,6 @@ class Pace:
         )
 
 
-class IntervalMetrics:
-    """Metrics of several chunks as one: episodes are counted, all else is a mean.
-
-    The means of a chunk weigh as much as its steps, those over episodes as much as its episodes. NaN means not
-    measured and has no weight.
-    """
-
-    def __init__(self) -> None:
-        self.sums: dict[str, np.ndarray] = {}
-        self.weights: dict[str, np.ndarray] = {}
-
-    def add(self, metrics: dict[str, np.ndarray], steps: int) -> None:
-        for name, value in metrics.items():
-            weight = metrics["train_episodes"] if name in ("train_return", "train_length") else np.float64(steps)
-            known = ~np.isnan(value)
-            if name == "train_episodes":
-                self.sums[name] = self.sums.get(name, 0.0) + value
-                self.weights[name] = np.ones_like(value)
-            else:
-                self.sums[name] = self.sums.get(name, 0.0) + np.where(known, value, 0.0) * weight
-                self.weights[name] = self.weights.get(name, 0.0) + known * weight
-
-    def result(self) -> dict[str, np.ndarray]:
-        def mean(total: np.ndarray, weight: np.ndarray) -> np.ndarray:
-            return np.divide(total, weight, out=np.full(total.shape, np.nan), where=weight > 0)
-
-        return {name: mean(total, self.weights[name]) for name, total in self.sums.items()}
-
-
 @partial(jax.jit, static_argnums=1)
 def _finite(tree: Any, num_members: int) -> jax.Array:
     """[S] bool: whether all of a member's own floating-point numbers are finite."""
@@ -145,6 +116,7 @@ def train_loop(
     pace = Pace()
     diverged: dict[int, int] = {}
     done = 0
+    last_point = 0  # where the interval began
     interrupted = False
     last_return: float | None = None
 
@@ -183,31 +155,30 @@ def train_loop(
     def send(metrics: dict[str, np.ndarray], returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
         report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths))
 
-    def measured(interval: IntervalMetrics) -> dict[str, np.ndarray]:
-        """The interval's means and the state's status; nothing before the first step."""
-        if not interval.sums:
-            return {}
-        return interval.result() | {name: np.asarray(value) for name, value in sweep.status(state).items()}
+    def measured() -> dict[str, np.ndarray]:
+        """What the state tells of the interval; nothing before the first step."""
+        return {name: np.asarray(value) for name, value in sweep.measure(state).items()} if done else {}
 
     for point in evaluation_steps(train):
-        interval = IntervalMetrics()
+        state = new_interval(state)
         while done < point and not stop():
             learn = done >= train.warmup_steps
             end = point if learn else min(point, train.warmup_steps)
             steps = pace.chunk(learn, (end - done) // train.num_envs)
             show(("training" if learn else "warm-up") if pace.compiled else "compiling the training", learn)
             start = clock()
-            state, metrics = sweep.advance(state, steps, learn)
-            interval.add({name: np.asarray(value) for name, value in metrics.items()}, steps)  # waits for the device
+            state = sweep.advance(state, steps, learn)
+            jax.block_until_ready(state.env_steps)
             pace.advanced(learn, steps, clock() - start)
             done += steps * train.num_envs
         if stop():
             interrupted = True
-            if interval.sums:
-                find_diverged(measured(interval), None)
-                send(measured(interval), None, None)
+            if done > last_point:
+                find_diverged(measured(), None)
+                send(measured(), None, None)
             break
-        evaluate_and_report(measured(interval))
+        evaluate_and_report(measured())
+        last_point = point
 
     timed = pace.steps * train.num_envs * num_members
     rate = timed / pace.train_seconds if pace.train_seconds else None

@@ -38,8 +38,12 @@ class Episodes(NamedTuple):
         return episodes, total
 
     def forget_ended(self) -> "Episodes":
-        zero = jnp.zeros(())
-        return self._replace(ended_return=zero, ended_length=zero, ended=zero)
+        # An array each: a buffer can be donated once only.
+        return self._replace(
+            ended_return=jnp.zeros_like(self.ended_return),
+            ended_length=jnp.zeros_like(self.ended_length),
+            ended=jnp.zeros_like(self.ended),
+        )
 
 
 def reset(env: Environment, key: Array, num_envs: int) -> TimeStep:

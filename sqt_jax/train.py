@@ -23,6 +23,29 @@ SHARED_LEAVES = frozenset({"env_steps", "gradient_steps", "pointer", "size"})
 TRAINING, EVALUATION = 0, 1  # what a member's key is folded with, so that the two streams never meet
 
 
+class Means(NamedTuple):
+    """Running means of metrics; a NaN is a value that was not measured."""
+
+    mean: Metrics
+    measured: Metrics  # how many values
+
+    @classmethod
+    def start(cls, like: Metrics) -> "Means":
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), like)
+        return cls(zeros, zeros)
+
+    def add(self, metrics: Metrics) -> "Means":
+        count = jax.tree.map(lambda n, x: n + ~jnp.isnan(x), self.measured, metrics)
+        # Never far from the values themselves, so that a long interval does not lose digits as a sum would.
+        mean = jax.tree.map(
+            lambda m, n, x: m + jnp.where(jnp.isnan(x), 0.0, (x - m) / jnp.maximum(n, 1)), self.mean, count, metrics
+        )
+        return Means(mean, count)
+
+    def result(self) -> Metrics:
+        return jax.tree.map(lambda m, n: jnp.where(n > 0, m, jnp.nan), self.mean, self.measured)
+
+
 class TrainState(NamedTuple):
     agent: State
     timestep: TimeStep  # [E, ...]
@@ -30,42 +53,31 @@ class TrainState(NamedTuple):
     replay: State
     key: Array  # the member's own; every draw folds a counter into it
     env_steps: Array  # [] int32: transitions so far
+    means: Means  # of the updates' metrics, since `new_interval`
 
 
 class Trainer(NamedTuple):
     """Training of one member."""
 
     init: Callable[..., TrainState]  # (key, scalars=None) -> state
-    advance: Callable[[TrainState, Any, Any], tuple[TrainState, Metrics]]  # (state, num_steps, learn)
+    advance: Callable[[TrainState, Any, Any], TrainState]  # (state, num_steps, learn)
     evaluate: Callable[[TrainState], Evaluation]
-    status: Callable[[TrainState], Metrics]  # what is worth reporting of a state as it is
+    measure: Callable[[TrainState], Metrics]  # what is worth reporting of the interval, and of the state at its end
 
 
 class Sweep(NamedTuple):
     """Training of S members in lockstep: the functions of `Trainer` with a leading [S], jit-compiled."""
 
     init: Callable[[Array, Scalars], TrainState]  # (keys [S], scalars of [S] each)
-    advance: Callable[[TrainState, int, bool], tuple[TrainState, Metrics]]  # donates the state
+    advance: Callable[[TrainState, int, bool], TrainState]  # donates the state
     evaluate: Callable[[TrainState], Evaluation]
-    status: Callable[[TrainState], Metrics]
+    measure: Callable[[TrainState], Metrics]
 
 
-class _Mean(NamedTuple):
-    """Running means of metrics; a NaN is a value that was not measured."""
-
-    total: Metrics
-    weight: Metrics
-
-    @classmethod
-    def start(cls, like: Metrics) -> "_Mean":
-        return cls(jax.tree.map(lambda x: jnp.zeros(x.shape), like), jax.tree.map(lambda x: jnp.zeros(x.shape), like))
-
-    def add(self, metrics: Metrics) -> "_Mean":
-        total = jax.tree.map(lambda t, x: t + jnp.where(jnp.isnan(x), 0.0, x), self.total, metrics)
-        return _Mean(total, jax.tree.map(lambda w, x: w + ~jnp.isnan(x), self.weight, metrics))
-
-    def result(self) -> Metrics:
-        return jax.tree.map(lambda t, w: t / w, self.total, self.weight)  # 0 / 0 = NaN: never measured
+def new_interval(state: TrainState) -> TrainState:
+    """From here on, what `measure` tells of is measured anew."""
+    means = jax.tree.map(jnp.zeros_like, state.means)
+    return state._replace(episodes=state.episodes.forget_ended(), means=means)
 
 
 def make_trainer(
@@ -80,20 +92,24 @@ def make_trainer(
 
     def init(key: Array, scalars: Scalars | None = None) -> TrainState:
         agent_key, env_key, own_key = jax.random.split(key, 3)
+        agent_state, replay_state = agent.init(agent_key, scalars), replay.init()
+        batch, _ = jax.eval_shape(replay.sample, replay_state, own_key)
+        _, _, metrics = jax.eval_shape(agent.update, agent_state, batch, own_key)
         return TrainState(
-            agent=agent.init(agent_key, scalars),
+            agent=agent_state,
             timestep=rollout.reset(env, env_key, num_envs),
             episodes=rollout.Episodes.start(num_envs),
-            replay=replay.init(),
+            replay=replay_state,
             key=own_key,
             env_steps=jnp.zeros((), jnp.int32),
+            means=Means.start(metrics),
         )
 
     def key_for(purpose: int, state: TrainState) -> Array:
         """A key that is used at this step of this member for this purpose only."""
         return jax.random.fold_in(jax.random.fold_in(state.key, purpose), state.env_steps)
 
-    def step(state: TrainState, mean: _Mean, learn: Array) -> tuple[TrainState, _Mean]:
+    def step(state: TrainState, learn: Array) -> TrainState:
         act_key, warmup_key, update_key = jax.random.split(key_for(TRAINING, state), 3)
 
         def behaviour(obs):
@@ -107,35 +123,26 @@ def make_trainer(
         replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):
-            agent_state, replay_state, mean = carry
+            agent_state, replay_state, means = carry
             sample_key, noise_key = jax.random.split(jax.random.fold_in(update_key, i))
             batch, rows = replay.sample(replay_state, sample_key)
             agent_state, td_error, metrics = agent.update(agent_state, batch, noise_key)
             replay_state = replay.feedback(replay_state, rows, td_error, agent_state.gradient_steps)
-            return agent_state, replay_state, mean.add(metrics)
+            return agent_state, replay_state, means.add(metrics)
 
         # No updates in the warm-up: a loop of no iterations, so that warm-up and training are one compiled program.
-        carry = (agent_state, replay_state, mean)
-        agent_state, replay_state, mean = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, carry)
+        carry = (agent_state, replay_state, state.means)
+        agent_state, replay_state, means = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, carry)
         env_steps = state.env_steps + num_envs
-        return TrainState(agent_state, timestep, episodes, replay_state, state.key, env_steps), mean
+        return TrainState(agent_state, timestep, episodes, replay_state, state.key, env_steps, means)
 
-    def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> tuple[TrainState, Metrics]:
+    def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> TrainState:
         """`num_steps` lockstep steps, each of E transitions; without `learn`, random actions and no updates.
 
-        Both may be traced. The metrics are means over the call; NaN where nothing was measured.
+        Both may be traced. Several calls in a row are as one, bit for bit.
         """
-        sampled, _ = jax.eval_shape(replay.sample, state.replay, state.key)
-        mean = _Mean.start(jax.eval_shape(agent.update, state.agent, sampled, state.key)[2])
-        state = state._replace(episodes=state.episodes.forget_ended())
         learn = jnp.asarray(learn)
-        state, mean = jax.lax.fori_loop(0, num_steps, lambda _, carry: step(carry[0], carry[1], learn), (state, mean))
-        episodes = state.episodes
-        return state, mean.result() | {
-            "train_return": episodes.ended_return / episodes.ended,
-            "train_length": episodes.ended_length / episodes.ended,
-            "train_episodes": episodes.ended,
-        }
+        return jax.lax.fori_loop(0, num_steps, lambda _, state: step(state, learn), state)
 
     def evaluate_policy(state: TrainState) -> Evaluation:
         """Deterministic episodes from starts that training never saw, new ones at each evaluation."""
@@ -146,10 +153,21 @@ def make_trainer(
 
         return evaluate(eval_env or env, policy, key, config.eval_episodes)
 
-    def status(state: TrainState) -> Metrics:
-        return agent.status(state.agent) | jax.tree.map(jnp.sum, jax.vmap(env.status)(state.timestep))
+    def measure(state: TrainState) -> Metrics:
+        """Means since `new_interval` (NaN where nothing was measured), and the status of agent and environments."""
+        status = agent.status(state.agent) | jax.tree.map(jnp.sum, jax.vmap(env.status)(state.timestep))
+        episodes = state.episodes
+        return (
+            state.means.result()
+            | status
+            | {
+                "train_return": episodes.ended_return / episodes.ended,  # 0 / 0 = NaN: no episode ended
+                "train_length": episodes.ended_length / episodes.ended,
+                "train_episodes": episodes.ended,
+            }
+        )
 
-    return Trainer(init, advance, evaluate_policy, status)
+    return Trainer(init, advance, evaluate_policy, measure)
 
 
 def member_axes(state: State) -> Any:
@@ -169,9 +187,9 @@ def make_sweep(trainer: Trainer) -> Sweep:
     axes = member_axes(example)._replace(timestep=0)
     return Sweep(
         init=jax.jit(jax.vmap(trainer.init, out_axes=axes)),
-        advance=jax.jit(jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=(axes, 0)), donate_argnums=0),
+        advance=jax.jit(jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=axes), donate_argnums=0),
         evaluate=jax.jit(jax.vmap(trainer.evaluate, in_axes=(axes,))),
-        status=jax.jit(jax.vmap(trainer.status, in_axes=(axes,))),
+        measure=jax.jit(jax.vmap(trainer.measure, in_axes=(axes,))),
     )
 
 
@@ -193,8 +211,7 @@ class History(NamedTuple):
     env_steps: Array  # [evaluations]
     returns: Array  # [evaluations, episodes]
     lengths: Array  # [evaluations, episodes]
-    # [evaluations] each: means since the previous evaluation (where the warm-up ends: since then), and the status.
-    metrics: Metrics
+    metrics: Metrics  # [evaluations] each, as `Trainer.measure` gives them
 
 
 def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[TrainState, History]]:
@@ -208,13 +225,11 @@ def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[Tra
 
     def train(key: Array, scalars: Scalars | None = None) -> tuple[TrainState, History]:
         def phase(state, count_and_learn):
-            return trainer.advance(state, *count_and_learn)
+            return trainer.advance(state, *count_and_learn), None
 
         def interval(state, count):
-            state, metrics = jax.lax.scan(phase, state, (count, jnp.array([False, True])))
-            last = jnp.where(count[1] > 0, 1, 0)  # the phase that the interval ends in
-            metrics = jax.tree.map(lambda m: m[last], metrics) | trainer.status(state)
-            return state, (state.env_steps, trainer.evaluate(state), metrics)
+            state, _ = jax.lax.scan(phase, new_interval(state), (count, jnp.array([False, True])))
+            return state, (state.env_steps, trainer.evaluate(state), trainer.measure(state))
 
         start = trainer.init(key, scalars)
         state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, start, jnp.array(counts))

@@ -1,14 +1,14 @@
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.loop import IntervalMetrics, Pace, train_loop
+from experiments.loop import train_loop
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation
-from sqt_jax.train import Sweep
+from sqt_jax.rollout import Episodes
+from sqt_jax.train import Sweep, TrainState
 
 
 class FakeAgent(NamedTuple):
@@ -23,7 +23,7 @@ class Recorder:
         self.train, self.breaks_at = train, breaks_at
         self.now, self.done = 0.0, 0
         self.calls, self.reports, self.statuses, self.messages = [], [], [], []
-        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate, status=self.status)
+        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate, measure=self.measure)
         self.evaluated = lambda steps, returns: None
         self.update, self.message = self.statuses.append, self.messages.append
 
@@ -34,24 +34,22 @@ class Recorder:
         params = state.agent.params
         if self.breaks_at is not None and self.done >= self.breaks_at:
             params = params.at[1].set(jnp.nan)
-        agent = FakeAgent(params, state.agent.gradient_steps + steps * learn)
-        loss = np.full(2, float(self.done) if learn else np.nan)
-        episodes = {
-            "train_episodes": np.zeros(2),
-            "train_return": np.full(2, np.nan),
-            "train_length": np.full(2, np.nan),
-        }
-        return SimpleNamespace(agent=agent), {"loss": loss} | episodes
+        return state._replace(
+            agent=FakeAgent(params, state.agent.gradient_steps + steps * learn),
+            env_steps=jnp.int32(self.done),
+            means=state.means + steps * learn,
+        )
 
-    def status(self, state):
-        return {"best": np.full(2, float(self.done))}
+    def measure(self, state):
+        return {"updates": np.asarray(state.means)}
 
     def evaluate(self, state):
         self.now += 0.5
         return Evaluation(np.array([[self.done, self.done + 2], [0.0, 0.0]]), np.full((2, 2), 10))
 
     def run(self, stop=lambda: False):
-        state = SimpleNamespace(agent=FakeAgent(jnp.zeros(2), jnp.zeros((), jnp.int32)))
+        agent = FakeAgent(jnp.zeros(2), jnp.zeros((), jnp.int32))
+        state = TrainState(agent, None, Episodes.start(1), None, None, jnp.int32(0), means=jnp.zeros(2))
         return train_loop(
             self.sweep,
             state,
@@ -74,14 +72,6 @@ def test_evaluations_lie_at_zero_every_interval_and_the_end():
     assert recorder.reports[0].metrics == {}
     assert recorder.reports[2].returns.tolist() == [[1_000, 1_002], [0, 0]]
     assert (outcome.env_steps, outcome.interrupted, outcome.diverged) == (2_000, False, {})
-
-
-def test_metrics_of_an_interval_are_means_and_the_status_is_that_of_its_end():
-    recorder = Recorder(TRAIN)
-    recorder.run()
-    assert len([learn for _, learn in recorder.calls if learn]) > len(recorder.reports)  # intervals of several chunks
-    last = recorder.reports[-1].metrics
-    assert last["best"].tolist() == [2_000, 2_000] and np.all(last["loss"] < 2_000)
 
 
 def test_the_full_protocol_has_201_evaluations():
@@ -111,13 +101,8 @@ def test_environments_in_lockstep_share_the_steps():
 def test_metrics_are_those_since_the_last_evaluation():
     recorder = Recorder(TRAIN)
     recorder.run()
-    assert np.isnan(recorder.reports[1].metrics["loss"]).all()  # warm-up
-    # The fake loss of a chunk is the step at its end.
-    ends = np.cumsum([steps for steps, _ in recorder.calls])
-    steps = np.array([steps for steps, _ in recorder.calls])
-    last = ends > 1_500
-    expected = np.sum(ends[last] * steps[last]) / np.sum(steps[last])
-    np.testing.assert_allclose(recorder.reports[-1].metrics["loss"], expected)
+    updates = [report.metrics["updates"].tolist() for report in recorder.reports[1:]]
+    assert updates == [[0, 0], [250, 250], [500, 500], [500, 500]]
 
 
 def test_phases_and_time_left_are_shown():
@@ -138,7 +123,7 @@ def test_stopping_reports_what_there_is():
     assert outcome.interrupted and 1_100 <= outcome.env_steps < 1_500
     last = recorder.reports[-1]
     assert last.returns is None and last.env_steps == outcome.env_steps
-    assert np.isfinite(last.metrics["loss"]).all()
+    assert last.metrics["updates"].tolist() == [outcome.env_steps - 1_000] * 2
     assert len(recorder.reports) == 4  # 0, 500, 1000 and the rest
 
 
@@ -157,29 +142,3 @@ def test_a_member_with_numbers_that_are_not_finite_is_named_once():
     for report in recorder.reports:
         assert np.isnan(report.returns[1]).all() == (report.env_steps >= 1_000)
         assert np.isfinite(report.returns[0]).all()
-
-
-def test_interval_metrics_weigh_steps_and_episodes():
-    interval = IntervalMetrics()
-    nan = np.nan
-    first = {"loss": [1.0, nan], "train_return": [10.0, nan], "train_length": [5.0, nan], "train_episodes": [2.0, 0.0]}
-    second = {"loss": [4.0, 6.0], "train_return": [40.0, nan], "train_length": [8.0, nan], "train_episodes": [1.0, 0.0]}
-    for metrics, steps in ((first, 10), (second, 30)):
-        interval.add({name: np.array(values) for name, values in metrics.items()}, steps)
-    result = interval.result()
-    np.testing.assert_allclose(result["loss"], [(1 * 10 + 4 * 30) / 40, 6.0])
-    np.testing.assert_allclose(result["train_return"], [(10 * 2 + 40 * 1) / 3, nan])
-    np.testing.assert_allclose(result["train_length"], [6.0, nan])
-    np.testing.assert_allclose(result["train_episodes"], [3.0, 0.0])
-
-
-def test_the_first_chunk_is_not_timed():
-    pace = Pace()
-    assert pace.chunk(False, 1_000) == 1
-    pace.advanced(False, 1, 60.0)
-    assert pace.rates == {} and pace.train_seconds == 0.0
-    assert pace.chunk(False, 1_000) == 10
-    pace.advanced(False, 10, 0.1)
-    assert pace.chunk(False, 1_000) == 200
-    assert pace.chunk(False, 50) == 50
-    assert pace.chunk(True, 1_000) == 10  # another speed

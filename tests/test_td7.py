@@ -14,7 +14,7 @@ from sqt_jax.agents import td3, td7
 from sqt_jax.algorithms import agent_of, make_config, make_trainer
 from sqt_jax.config import AgentConfig
 from sqt_jax.envs.autoreset import make_environment
-from sqt_jax.train import Sweep, TrainState, make_sweep
+from sqt_jax.train import Sweep, TrainState, make_sweep, new_interval
 from sqt_jax.types import Agent, Transition
 
 O, A, B, N, Z = 3, 2, 8, 2, 6
@@ -305,13 +305,14 @@ def trained():
     env = reward_is_the_action()
     sweep = make_sweep(make_trainer(config, env))
     scalars = jax.tree.map(lambda value: jnp.full(MEMBERS, value), config.agent.scalars())
-    state, warm_metrics = sweep.advance(sweep.init(jax.random.split(KEY, MEMBERS), scalars), 20, False)
+    state = sweep.advance(sweep.init(jax.random.split(KEY, MEMBERS), scalars), 20, False)
+    warm_metrics = sweep.measure(state)
     warm, metrics = jax.device_get(state._replace(key=None, timestep=None)), []
     states = [warm.agent]
     for _ in range(12):
-        state, measured = sweep.advance(state, EPISODE, True)
+        state = sweep.advance(new_interval(state), EPISODE, True)
         states.append(jax.device_get(state.agent))
-        metrics.append(jax.device_get(measured | sweep.status(state)))
+        metrics.append(jax.device_get(sweep.measure(state)))
     return Trained(agent_of(config, env), sweep, warm, jax.device_get(warm_metrics), states, metrics, state)
 
 

@@ -38,6 +38,12 @@ def start(config, sweep, seeds=(0, 1, 2), **swept):
     return sweep.init(keys, scalars._replace(**{name: jnp.array(values) for name, values in swept.items()}))
 
 
+def advance(sweep, state, steps, learn):
+    """The state after so many steps, and what was measured in them."""
+    state = sweep.advance(train.new_interval(state), steps, learn)
+    return state, sweep.measure(state)
+
+
 def numbers(tree):
     """Leaves as NumPy arrays, keys as the integers they hold."""
     return [
@@ -58,7 +64,7 @@ def td3():
 def test_warmup_makes_steps_and_no_updates(td3):
     config, _, sweep = td3
     before = start(config, sweep)
-    after, metrics = sweep.advance(start(config, sweep), 40, False)
+    after, metrics = advance(sweep, start(config, sweep), 40, False)
     assert after.env_steps == 40 and after.agent.gradient_steps == 0 and after.replay.size == 40
     assert identical(before.agent, after.agent)
     assert np.isnan(metrics["critic_loss"]).all() and (metrics["train_episodes"] == 40).all()
@@ -68,17 +74,17 @@ def test_warmup_makes_steps_and_no_updates(td3):
 
 def test_training_makes_one_update_per_transition(td3):
     config, _, sweep = td3
-    state, _ = sweep.advance(start(config, sweep), 40, False)
-    state, metrics = sweep.advance(state, 30, True)
+    state, _ = advance(sweep, start(config, sweep), 40, False)
+    state, metrics = advance(sweep, state, 30, True)
     assert state.env_steps == 70 and state.agent.gradient_steps == 30
     assert all(np.isfinite(value).all() for value in metrics.values())
 
 
 def test_updates_per_step_and_num_envs_multiply():
     config, _, sweep = make("td3", num_envs=4, updates_per_step=3)
-    state, _ = sweep.advance(start(config, sweep), 10, False)
+    state, _ = advance(sweep, start(config, sweep), 10, False)
     assert state.env_steps == 40 and state.replay.size == 40
-    state, _ = sweep.advance(state, 5, True)
+    state, _ = advance(sweep, state, 5, True)
     assert state.env_steps == 60 and state.agent.gradient_steps == 5 * 4 * 3
 
 
@@ -86,7 +92,7 @@ def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):
     config, _, sweep = make.__wrapped__("td3")
     state = start(config, sweep)
     for steps, learn in [(7, False), (1, False), (5, True), (11, True)]:
-        state, _ = sweep.advance(state, steps, learn)
+        state, _ = advance(sweep, state, steps, learn)
         sweep.evaluate(state)
     assert sweep.advance._cache_size() == 1 and sweep.evaluate._cache_size() == 1
 
@@ -94,18 +100,44 @@ def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):
 def test_a_sweep_over_scalars_shares_one_compilation():
     config, _, sweep = make.__wrapped__("td3_sqt")
     for coef in ([0.0, 0.5, 1.0], [0.1, 0.2, 0.3]):
-        sweep.advance(start(config, sweep, penalty_coef=coef, lr=[1e-3, 1e-4, 1e-5]), 5, True)
+        advance(sweep, start(config, sweep, penalty_coef=coef, lr=[1e-3, 1e-4, 1e-5]), 5, True)
     assert sweep.advance._cache_size() == 1
 
 
-def test_chunks_do_not_change_the_training(td3):
+def test_chunks_change_nothing_at_all(td3):
     config, _, sweep = td3
-    state, _ = sweep.advance(start(config, sweep), 40, False)
-    whole, _ = sweep.advance(state, 20, True)
-    state, _ = sweep.advance(start(config, sweep), 25, False)
+    state = sweep.advance(start(config, sweep), 40, False)
+    whole = sweep.advance(state, 20, True)
+    state = sweep.advance(start(config, sweep), 25, False)
     for steps, learn in [(15, False), (3, True), (17, True)]:
-        state, _ = sweep.advance(state, steps, learn)
-    assert identical(whole._replace(episodes=None), state._replace(episodes=None))
+        state = sweep.advance(state, steps, learn)
+    assert identical(whole, state) and identical(sweep.measure(whole), sweep.measure(state))
+
+
+def test_what_is_measured_is_of_the_interval(td3):
+    config, _, sweep = td3
+    state, warm = advance(sweep, start(config, sweep), 40, False)
+    parts = []
+    for _ in range(3):
+        state, metrics = advance(sweep, state, 1, True)
+        parts.append(metrics)
+    state, _ = advance(sweep, start(config, sweep), 40, False)
+    state, metrics = advance(sweep, state, 3, True)
+    for name in ("critic_loss", "q_mean", "q_std"):
+        np.testing.assert_allclose(metrics[name], np.mean([part[name] for part in parts], axis=0), rtol=1e-5)
+    # The actor learned in the second step alone: the others do not count.
+    np.testing.assert_allclose(metrics["actor_loss"], parts[1]["actor_loss"], rtol=1e-5)
+    assert np.isnan(parts[0]["actor_loss"]).all() and np.isnan(warm["critic_loss"]).all()
+    assert (metrics["train_episodes"] == 3).all() and (warm["train_episodes"] == 40).all()
+    np.testing.assert_allclose(metrics["train_return"], np.mean([p["train_return"] for p in parts], axis=0), rtol=1e-5)
+
+
+def test_means_of_long_intervals_keep_their_digits():
+    values = jnp.float32(1000 + np.random.default_rng(0).normal(size=200_000))
+    values = values.at[::7].set(jnp.nan)  # not measured
+    means, _ = jax.lax.scan(lambda m, x: (m.add({"x": x}), None), train.Means.start({"x": jnp.zeros(())}), values)
+    expected = np.nanmean(np.asarray(values, np.float64))
+    assert abs(float(means.result()["x"]) - expected) < 1e-3
 
 
 def test_members_differ_in_parameters_starts_and_noise(td3):
@@ -113,8 +145,8 @@ def test_members_differ_in_parameters_starts_and_noise(td3):
     state = start(config, sweep)
     for leaf in numbers((state.agent.actor, state.agent.critic, state.timestep.obs, state.key)):
         assert not np.array_equal(leaf[0], leaf[1])
-    state, _ = sweep.advance(state, 40, False)
-    state, _ = sweep.advance(state, 10, True)
+    state, _ = advance(sweep, state, 40, False)
+    state, _ = advance(sweep, state, 10, True)
     actions = np.asarray(state.replay.storage[:, :50, 1])
     assert not np.isclose(actions[0], actions[1]).any()
 
@@ -127,8 +159,8 @@ def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
         lambda leaf, axis: leaf if axis is None else leaf[3:], together, axes, is_leaf=lambda x: x is None
     )
     assert identical(alone, own)
-    alone, _ = sweep.advance(alone, 40, False)
-    together, _ = sweep.advance(together, 40, False)
+    alone, _ = advance(sweep, alone, 40, False)
+    together, _ = advance(sweep, together, 40, False)
     rows = alone.replay.storage[0], together.replay.storage[3]
     assert np.array_equal(rows[0][:, :3], rows[1][:, :3])  # obs, action, next_obs
     np.testing.assert_allclose(rows[0][:, 3:], rows[1][:, 3:], rtol=1e-4, atol=1e-6)
@@ -139,8 +171,8 @@ def test_a_seed_trains_alone_as_in_a_sweep(algo):
     config, _, sweep = make(algo)
     results = []
     for seeds in [(3,), (0, 1, 2, 3)]:
-        state, _ = sweep.advance(start(config, sweep, seeds), 40, False)
-        state, _ = sweep.advance(state, 100, True)
+        state, _ = advance(sweep, start(config, sweep, seeds), 40, False)
+        state, _ = advance(sweep, state, 100, True)
         results.append((state.agent.critic, state.agent.actor, state.replay.storage))
     for alone, together in zip(numbers(results[0]), numbers(results[1]), strict=True):
         np.testing.assert_allclose(alone[0], together[3], rtol=1e-4, atol=1e-6)
@@ -152,8 +184,8 @@ def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(
     trained = {}
     for name, coef in [(plain, 0.0), (algo, 0.0), (algo, 0.5)]:
         config, _, sweep = make(name, probe_envs.constant_reward)
-        state, _ = sweep.advance(start(config, sweep, penalty_coef=[coef] * 3), 40, False)
-        state, _ = sweep.advance(state, 60, True)
+        state, _ = advance(sweep, start(config, sweep, penalty_coef=[coef] * 3), 40, False)
+        state, _ = advance(sweep, state, 60, True)
         trained[name, coef] = (state.agent.actor, state.agent.critic)
     assert identical(trained[plain, 0.0], trained[algo, 0.0])
     assert not identical(trained[plain, 0.0], trained[algo, 0.5])
@@ -163,19 +195,19 @@ def test_the_same_seeds_twice_are_bit_identical(td3):
     config, _, sweep = td3
     runs = []
     for _ in range(2):
-        state, _ = sweep.advance(start(config, sweep), 40, False)
-        runs.append(sweep.advance(state, 50, True))
+        state, _ = advance(sweep, start(config, sweep), 40, False)
+        runs.append(advance(sweep, state, 50, True))
     assert identical(*runs)
 
 
 def test_evaluation_leaves_the_state_alone_and_draws_new_starts_each_time(td3):
     config, _, sweep = td3
-    state, _ = sweep.advance(start(config, sweep), 40, False)
+    state, _ = advance(sweep, start(config, sweep), 40, False)
     copy = numbers(state)
     first = sweep.evaluate(state)
     assert all(np.array_equal(a, b) for a, b in zip(copy, numbers(state), strict=True))
     assert np.array_equal(first.returns, sweep.evaluate(state).returns)
-    state, _ = sweep.advance(state, 1, False)
+    state, _ = advance(sweep, state, 1, False)
     assert not np.isclose(first.returns, sweep.evaluate(state).returns).any()
 
 
@@ -200,8 +232,10 @@ def test_make_train_under_vmap_is_the_sweep(td3):
     state = start(config, sweep)
     returns = [sweep.evaluate(state).returns]
     for first, last in zip(range(0, 400, 100), range(100, 401, 100), strict=True):
+        state = train.new_interval(state)
         for steps, learn in train.segments(first, last, config.train):
-            state, metrics = sweep.advance(state, steps, learn)
+            state = sweep.advance(state, steps, learn)
+        metrics = sweep.measure(state)
         returns.append(sweep.evaluate(state).returns)
     np.testing.assert_allclose(history.returns, jnp.stack(returns, 1), rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(history.metrics["critic_loss"][:, -1], metrics["critic_loss"], rtol=1e-2)
@@ -231,8 +265,8 @@ def test_memory_estimate_is_the_size_of_what_is_held():
 
 
 def optimised(sweep, state):
-    """`sweep.advance` compiled for speed, where a test learns for long (conftest: tests compile fast by default)."""
-    return sweep.advance.lower(state, 1, True).compile({"xla_backend_optimization_level": 3})
+    """The sweep compiled for speed, where a test learns for long (conftest: tests compile fast by default)."""
+    return sweep._replace(advance=sweep.advance.lower(state, 1, True).compile({"xla_backend_optimization_level": 3}))
 
 
 LEARN = {
@@ -256,10 +290,10 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
         algo, **{name: v for name, v in settings.items() if name not in ALGORITHMS[algo].ignores}
     )
     state = start(config, sweep)
-    advance = optimised(sweep, state)
-    state, _ = advance(state, 200, False)
-    state, _ = advance(state, 1300, True)
-    state, metrics = advance(state, 200, True)
+    sweep = optimised(sweep, state)
+    state, _ = advance(sweep, state, 200, False)
+    state, _ = advance(sweep, state, 1300, True)
+    state, metrics = advance(sweep, state, 200, True)
     obs = jnp.linspace(-0.4, 0.4, 5)[:, None]
     agent = algorithms.agent_of(config, probe_envs.one_step())
     axes = train.member_axes(state.agent)
@@ -277,10 +311,10 @@ def test_truncation_bootstraps_and_termination_does_not(algo):
         settings = LEARN | {"tau": 0.1} | ({"temperature": 0.001} if algo == "sac" else {})
         config, _, sweep = make(algo, env, **settings)
         state = start(config, sweep)
-        advance = optimised(sweep, state)
-        state, _ = advance(state, 200, False)
-        state, _ = advance(state, 2000, True)
-        state, metrics = advance(state, 200, True)
+        sweep = optimised(sweep, state)
+        state, _ = advance(sweep, state, 200, False)
+        state, _ = advance(sweep, state, 2000, True)
+        state, metrics = advance(sweep, state, 200, True)
         values[env] = np.median(metrics["q_mean"])
     assert values[probe_envs.constant_reward] == pytest.approx(10, rel=0.1)
     # the mean over the three states
@@ -290,5 +324,5 @@ def test_truncation_bootstraps_and_termination_does_not(algo):
 def test_an_environment_may_call_its_fields_as_it_likes():
     """`size` is a counter that members share in the replay, and each member's own in an environment."""
     config, _, sweep = make("td3", probe_envs.with_a_field_called_size)
-    state, metrics = sweep.advance(start(config, sweep), 50, True)
+    state, metrics = advance(sweep, start(config, sweep), 50, True)
     assert state.timestep.state.task.size.shape == (3, 1) and (metrics["train_episodes"] > 0).all()
