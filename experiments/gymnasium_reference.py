@@ -25,11 +25,12 @@ class Recorded(NamedTuple):
 def gymnasium_environment(name: str) -> Any:
     import gymnasium
 
+    handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         env = gymnasium.make(TASKS[name].gymnasium_id).unwrapped
-    mujoco.set_mju_user_warning(None)
+    mujoco.set_mju_user_warning(handler)
     return env
 
 

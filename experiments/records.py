@@ -18,6 +18,7 @@ from scipy import stats
 from tensorboardX import SummaryWriter
 
 from experiments.loop import Outcome, Report
+from sqt_jax.algorithms import eval_physics_of
 from sqt_jax.config import Config
 
 # The columns that every evaluations.csv has; further swept scalars follow.
@@ -262,6 +263,7 @@ def describe(members: Sequence[Member], swept: Sequence[str], command: Sequence[
     return {
         "settings": members[0].config.flat(),
         "preset": preset,
+        "evaluated_on": eval_physics_of(members[0].config),
         "members": [
             {"member": index, "seed": member.seed}
             | {name: getattr(member.config.agent, name) for name in dict.fromkeys(["penalty_coef", *swept])}

@@ -17,6 +17,7 @@ from experiments import runtime
 from sqt_jax import envs, rollout
 from sqt_jax.envs import TASKS
 
+GROWTH_MIB = 64  # more than allocators' noise, far less than a leak of a few bytes a step
 FLAGS = flags.FLAGS
 flags.DEFINE_integer("steps", 10_000_000, "Environment steps in all.", lower_bound=1)
 flags.DEFINE_integer("envs", 64, "Environments side by side.", lower_bound=1)
@@ -54,6 +55,7 @@ def main(argv: Sequence[str]) -> None:
     state = {task: start for task, (_, _, start) in parts.items()}
     per_part = -(-FLAGS.steps // (FLAGS.rounds * len(parts) * FLAGS.envs))  # lockstep steps
     done, began = 0, time.monotonic()
+    memory = []
     for turn in range(FLAGS.rounds):
         for number, (task, (env, part, _)) in enumerate(parts.items()):
             key = jax.random.fold_in(jax.random.key(turn), number)
@@ -67,7 +69,11 @@ def main(argv: Sequence[str]) -> None:
                 f"{task}: {unstable} unstable steps",
                 flush=True,
             )
-    print("all numbers finite")
+        memory.append(process.memory_info().rss / 2**20)
+    growth = memory[-1] - memory[0]
+    if growth > GROWTH_MIB:
+        sys.exit(f"memory grew by {growth:.0f} MiB after the first round")
+    print(f"all numbers finite; memory grew by {growth:.0f} MiB after the first round")
 
 
 if __name__ == "__main__":

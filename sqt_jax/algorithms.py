@@ -135,7 +135,7 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     Raises:
       ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
     """
-    physics, eval_physics = settings.pop("physics", Config.physics), settings.pop("eval_physics", Config.eval_physics)
+    physics, eval_physics = settings.pop("physics", None), settings.pop("eval_physics", Config.eval_physics)
     training = {name: settings.pop(name) for name in TRAIN_SETTINGS & settings.keys()}
     if algo in ALGORITHMS:
         _refuse_unknown(settings, AGENT_SETTINGS | TRAIN_SETTINGS)
@@ -145,6 +145,7 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
     known = envs.simulators(env)
+    physics = physics or known[0]
     if physics not in known:
         raise ConfigError("physics", f"{unknown(physics, known)} for {env}")
     if eval_physics not in ("auto", *known):

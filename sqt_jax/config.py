@@ -96,7 +96,7 @@ class Config:
 
     algo: str
     env: str
-    physics: str = "mjx"
+    physics: str = "mjx"  # `make_config`'s default is the first that can compute the environment
     eval_physics: str = "auto"  # auto: MuJoCo C where the program runs on a CPU, else the training's
     agent: AgentConfig = AgentConfig()
     train: TrainConfig = TrainConfig()

@@ -43,21 +43,27 @@ def evaluate_policy(
 
     Args:
       policy: obs [B, O] -> action [B, A] in [-1, 1].
-      env: an `Environment` on any physics, or one of Gymnasium's, whose action space is a bounded box.
+      env: an `Environment` on any physics, or one of Gymnasium's, whose action space is a bounded box and whose
+        episodes end (made by `gymnasium.make`, they have a time limit).
 
     Returns:
       Undiscounted returns [episodes] and lengths [episodes].
+
+    Raises:
+      ValueError: a Gymnasium environment's actions have no bounds.
     """
     if isinstance(env, Environment):
         result = jax.jit(lambda key: evaluate(env, policy, key, num_episodes))(jax.random.key(seed))
         return np.asarray(result.returns), np.asarray(result.lengths)
     low, high = env.action_space.low, env.action_space.high
+    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
+        raise ValueError(f"an action space with bounds is needed, not {env.action_space}")
     returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, int)
     for episode in range(num_episodes):
         obs, _ = env.reset(seed=seed + episode)
         over = False
         while not over:
-            action = np.asarray(policy(np.asarray(obs, np.float32)[None]))[0]
+            action = np.clip(policy(np.asarray(obs, np.float32)[None])[0], -1, 1)
             obs, reward, terminated, truncated, _ = env.step(low + (action + 1) / 2 * (high - low))
             returns[episode] += reward
             lengths[episode] += 1

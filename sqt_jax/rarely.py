@@ -2,6 +2,9 @@
 
 `jax.lax.cond` on a batched predicate becomes a `select`: both branches run for all. Here the branch runs if the
 predicate holds anywhere in the batch, and where it holds nowhere, nothing is computed and nothing is copied.
+
+Derivatives go forward only (`jax.jvp`): JAX cannot transpose a function with a batching rule of its own. What is
+trained here needs no derivative of an environment's step.
 """
 
 from collections.abc import Callable

@@ -5,7 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.run import main
 from sqt_jax import envs
+from sqt_jax.algorithms import make_config
+from sqt_jax.config import ConfigError
 from sqt_jax.envs.brax_envs import NAMES, PIPELINES
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Brax's own
@@ -62,10 +65,47 @@ def test_the_time_limit_truncates(pendulum):
     assert step(late, jnp.zeros(1)).truncated and not step(timestep, jnp.zeros(1)).truncated
 
 
-@pytest.mark.parametrize("physics", [name for name in PIPELINES if name != "mujoco"])
-def test_every_pipeline_has_the_same_sizes(physics):
+SLOW = pytest.param("mjx", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("physics", [SLOW if name == "mjx" else name for name in PIPELINES])
+def test_every_pipeline_makes_steps_and_is_compiled_once(physics):
     env = envs.make(NAME, physics)
     assert (env.observation_size, env.action_size, env.name) == (4, 1, NAME)
+    step = jax.jit(env.step)
+    timestep = jax.jit(env.reset)(jax.random.key(0))
+    for _ in range(3):
+        timestep = step(timestep, jnp.ones(1))
+        assert timestep.obs.shape == (4,) and np.all(np.isfinite(timestep.obs)) and timestep.reward == 1
+    assert step._cache_size() == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_steps_on_all_that_it_says_can_compute_it(name):
+    """Traced, not compiled."""
+    for physics in envs.simulators(name):
+        env = envs.make(name, physics)
+        timestep = jax.eval_shape(env.reset, jax.random.key(0))
+        after = jax.eval_shape(env.step, timestep, jax.ShapeDtypeStruct((env.action_size,), jnp.float32))
+        assert after.obs.shape == (env.observation_size,)
+        assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, timestep)
+
+
+def test_a_run_trains_on_brax(tmp_path):
+    argv = ["run", "--algo=td3_sqt", f"--env={NAME}", "--physics=spring", "--steps=60", "--warmup_steps=20"]
+    argv += ["--eval_every=60", "--eval_episodes=1", "--hidden=8", "--batch_size=8", f"--out={tmp_path}", "--name=tiny"]
+    assert main([*argv, "--quiet", "--seeds=0,1"]) == 0
+    assert (tmp_path / NAME / "td3_sqt" / "tiny" / "policy" / "member_1.npz").exists()
+
+
+def test_the_swimmer_has_one_pipeline_and_takes_it_by_itself():
+    assert envs.simulators("brax:swimmer") == ("generalized",)
+    assert make_config("td3", "brax:swimmer").physics == "generalized"
+    with pytest.raises(ConfigError, match="--physics: takes one of generalized, not 'mjx' for brax:swimmer"):
+        make_config("td3", "brax:swimmer", physics="mjx")
+    with pytest.raises(ConfigError, match="--eval_physics: takes one of auto, generalized, not 'spring'"):
+        make_config("td3", "brax:swimmer", eval_physics="spring")
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,12 @@
 import sys
 import types
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.gymnasium_reference import gymnasium_environment
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
 from sqt_jax.envs.physics import PHYSICS, Physics, PhysicsState
@@ -132,8 +132,6 @@ def test_v5_leaves_out_the_worlds_entries_and_the_roots_forces_and_clips():
 @pytest.mark.parametrize("name", TASKS)
 def test_starts_have_gymnasiums_distribution(name):
     task, model = TASKS[name], gym_tasks.load_model(TASKS[name])
-    scale = gymnasium.spec(task.gymnasium_id).kwargs.get("reset_noise_scale", task.noise)
-    assert task.noise == scale
     keys = jax.random.split(jax.random.key(0), 4000)
     qpos, qvel = jax.vmap(lambda key: gym_tasks.draw_start(task, model.qpos0, model.nv, key))(keys)
     offset = (np.asarray(qpos, np.float64) - model.qpos0) / task.noise
@@ -145,6 +143,17 @@ def test_starts_have_gymnasiums_distribution(name):
     np.testing.assert_allclose(velocity.mean(axis=0), 0, atol=0.08)
     np.testing.assert_allclose(velocity.std(axis=0), 1 if task.normal_velocity else 1 / np.sqrt(3), atol=0.05)
     assert (np.abs(velocity).max() > 2) == task.normal_velocity
+    # And what Gymnasium itself draws, in units of what the table says of it.
+    env = gymnasium_environment(name)
+    env.reset(seed=0)
+    theirs = []
+    for _ in range(500):
+        env.reset_model()
+        theirs.append(np.concatenate([env.data.qpos - model.qpos0, env.data.qvel]) / task.noise)
+    their_offset, their_velocity = np.split(np.array(theirs), [model.nq], axis=1)
+    assert 0.97 < np.abs(their_offset).max() <= 1 and (np.abs(their_velocity).max() > 2) == task.normal_velocity
+    np.testing.assert_allclose(their_offset.std(axis=0), offset.std(axis=0), atol=0.08)
+    np.testing.assert_allclose(their_velocity.std(axis=0), velocity.std(axis=0), atol=0.15)
     assert np.abs(np.corrcoef(offset[:, 0], velocity[:, 0])[0, 1]) < 0.06  # positions and velocities: own draws
 
 

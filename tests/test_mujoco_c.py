@@ -1,5 +1,10 @@
 """MuJoCo C inside compiled programs; that whole episodes are Gymnasium's is in test_gymnasium_parity."""
 
+import concurrent.futures
+import os
+import signal
+import time
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -121,7 +126,7 @@ def test_the_state_is_carried_in_float64(ant):
 def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     env = envs.make("ant", "mujoco")
-    gym_tasks.load_model(TASKS["cheetah"])  # which lets MuJoCo speak again
+    gym_tasks.load_model(TASKS["cheetah"])  # which has to do with MuJoCo's warnings too
     timestep = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
     qvel = timestep.state.task.qvel.at[1, 2].set(fault)
     broken = jax.vmap(env.set_physics)(timestep.state.task.qpos, qvel)
@@ -134,6 +139,79 @@ def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeyp
     assert np.all(np.isfinite(going_on.final_obs)) and not going_on.terminated.any()
     assert list(tmp_path.iterdir()) == []  # MuJoCo wrote no log
     assert capfd.readouterr().err == ""
+
+
+def test_a_warning_handler_of_ones_own_stays(ant):
+    physics, model, advance = ant
+    heard = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(heard.append)
+    try:
+        state, control = robots(physics, model, 2)
+        advance(state._replace(internal=state.internal.at[0, 3].set(jnp.uint32(0x7FC00000))), control)
+        gym_tasks.load_model(TASKS["cheetah"])
+        mine = mujoco.get_mju_user_warning()
+        mine("heard")
+    finally:
+        mujoco.set_mju_user_warning(before)
+    assert "heard" in heard
+
+
+def test_programs_in_several_threads_do_not_disturb_each_other(ant):
+    physics, model, advance = ant
+    state, control = robots(physics, model, 6)
+    expected = advance(state, control)
+    mujoco_c._pools.clear()  # all of them ask for a pool at once
+    fresh = mujoco_c.make(setup_of("ant"), num_threads=2)
+    step = jax.jit(jax.vmap(fresh.advance))
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        results = list(pool.map(lambda _: jax.block_until_ready(step(state, control)), range(40)))
+    assert all(same(result, expected) for result in results)
+    assert len(mujoco_c._pools) == 1
+
+
+def test_an_interrupt_waits_for_the_threads():
+    """Ctrl-C while the helpers still work: it is raised, but not before they have ended."""
+    ended = []
+
+    def work(number):
+        time.sleep(0.02 if number == 0 else 0.3)
+        ended.append(number)
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            mujoco_c._threads(3).run(work, 3)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert sorted(ended) == [0, 1, 2]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+def test_a_forked_child_has_threads_of_its_own():
+    mujoco_c._threads(3).run(lambda number: None, 3)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # else a child that waits for its parent's threads would wait forever
+        seen = []
+        mujoco_c._threads(3).run(seen.append, 3)
+        os._exit(0 if sorted(seen) == [0, 1, 2] else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_cores_are_counted_where_the_system_cannot_tell_which_may_be_used(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    assert mujoco_c.usable_cores() == os.cpu_count()
+
+
+def test_no_threads_are_refused():
+    with pytest.raises(ValueError, match="num_threads takes at least 1, not 0"):
+        mujoco_c.make(setup_of("ant"), num_threads=0)
 
 
 def test_an_error_in_a_thread_is_raised_once_all_have_ended():

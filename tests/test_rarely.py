@@ -70,6 +70,10 @@ def test_the_branch_is_one_in_the_compiled_loop():
     _, old, given = arguments(4, 3)
     text = jax.jit(loop).lower(old, given).compile().as_text()
     assert len(re.findall(r" conditional\(", text)) == 1
+    # What holds the state in the loop itself: the conditional's results and what passes them on.
+    body = next(part for part in text.split("\n\n") if " conditional(" in part)
+    kinds = set(re.findall(r"= f32\[4,3,3\]\S* ([\w-]+)\(", body))
+    assert kinds <= {"get-tuple-element", "parameter"}, kinds
 
 
 def test_the_branch_runs_only_where_it_is_asked_for():

@@ -28,17 +28,20 @@ def resolve(name: str) -> str:
 
 def simulators(name: str) -> tuple[str, ...]:
     """The physics that can compute an environment, by its own name; the first is the default."""
-    return brax_envs.PIPELINES if name in brax_envs.NAMES else tuple(PHYSICS)
+    return brax_envs.pipelines(name) if name in brax_envs.NAMES else tuple(PHYSICS)
 
 
-def make(name: str, physics: str = "mjx", **options: Any) -> Environment:
+def make(name: str, physics: str | None = None, **options: Any) -> Environment:
     """Make the environment `name` (an alias of it, or a Gymnasium id) on a simulator, with that simulator's options.
+
+    Without `physics`, on the first of its `simulators`.
 
     Raises:
       ValueError: the environment or the simulator is unknown.
       TypeError: the simulator has no such option.
     """
     name = resolve(name)
+    physics = physics or simulators(name)[0]
     if physics not in simulators(name):
         raise ValueError("physics " + unknown(physics, simulators(name)))
     if name in brax_envs.NAMES:

@@ -11,6 +11,7 @@ import warnings
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from sqt_jax.envs.autoreset import make_environment
 from sqt_jax.types import Array, Environment
@@ -33,11 +34,17 @@ NAMES = tuple(
     )
 )
 PIPELINES = ("mjx", "generalized", "spring", "positional")
+ONLY = {"brax:swimmer": ("generalized",)}  # Brax gives it no others
 EPISODE_LENGTH = 1000  # as in Brax's training configurations
 
 
+def pipelines(name: str) -> tuple[str, ...]:
+    """What can compute the environment `name`; the first is the default."""
+    return ONLY.get(name, PIPELINES)
+
+
 def make_brax(name: str, physics: str) -> Environment:
-    """The environment `name` (with its prefix) on one of `PIPELINES`."""
+    """The environment `name` (with its prefix) on one of its `pipelines`."""
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that Brax's pipelines are no longer developed
         from brax import envs
@@ -45,13 +52,18 @@ def make_brax(name: str, physics: str) -> Environment:
         env = envs.get_environment(name.removeprefix(PREFIX), backend=physics)
 
     def start(key: Array) -> tuple[Any, Array]:
-        state = env.reset(key)
+        with jax.default_matmul_precision("highest"):  # which GPUs do not give unasked
+            state = _strong(env.reset(key))
         return state, state.obs
 
     def advance(state: Any, action: Array) -> tuple[Any, Array, Array, Array]:
-        # Matrix products in full precision, which GPUs do not give unasked.
         with jax.default_matmul_precision("highest"):
-            state = env.step(state, action)
+            state = _strong(env.step(state, action))
         return state, state.obs, state.reward, state.done > 0
 
     return make_environment(name, env.observation_size, env.action_size, EPISODE_LENGTH, start, advance)
+
+
+def _strong(tree: Any) -> Any:
+    """Leaves with types of their own: a weak type would be another one to `jit`, which compiles for each."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, jnp.result_type(leaf)), tree)

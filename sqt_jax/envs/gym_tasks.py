@@ -71,11 +71,12 @@ def load_model(task: Task) -> mujoco.MjModel:
         raise FileNotFoundError("the models of the locomotion tasks are in the package gymnasium: not installed")
     path = Path(spec.origin).parent / "envs" / "mujoco" / "assets" / task.xml
     # the cheetah's file uses a deprecated attribute; MuJoCo would write so into a log file in the current directory
+    handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     finally:
-        mujoco.set_mju_user_warning(None)
+        mujoco.set_mju_user_warning(handler)
 
 
 def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:

@@ -11,7 +11,6 @@ import os
 import queue
 import threading
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import jax
@@ -39,12 +38,14 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
       num_threads: threads that step robots; None is one for each core that the process may use.
 
     Raises:
-      ValueError: the model has activation states.
+      ValueError: the model has activation states, or there is no thread.
     """
     model = setup.model
     if model.na:
         raise ValueError(f"{model.na} activation states: only models with none")
-    stepper = Stepper(setup, num_threads or len(os.sched_getaffinity(0)))
+    if num_threads is not None and num_threads < 1:
+        raise ValueError(f"num_threads takes at least 1, not {num_threads}")
+    stepper = Stepper(setup, num_threads or usable_cores())
     num_places = model.nq + model.nv
     # a header (0: just placed, the words are float32; 1: stepped, they are float64), x of the tracked point, STATE
     state_words = 1 + 2 * (1 + num_places + model.nv)
@@ -100,7 +101,11 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
 
 
 class Stepper:
-    """A control step of many robots, on several threads. NumPy only: nothing of JAX may run inside a callback."""
+    """A control step of many robots, on several threads. NumPy only: nothing of JAX may run inside a callback.
+
+    Where nobody has set a handler of MuJoCo's warnings, one is set that drops them: MuJoCo would write of diverged
+    robots into a file in the current directory.
+    """
 
     def __init__(self, setup: Setup, num_threads: int):
         self.setup = setup
@@ -119,9 +124,8 @@ class Stepper:
         Returns:
           [R, F] float32: qpos, qvel, the tracked point's displacement, the quantities; NaN where the robot diverged.
         """
-        # Else MuJoCo writes of diverged robots into a file in the current directory. At each step, since whoever loads
-        # a model or makes a Gymnasium environment may have set it otherwise.
-        mujoco.set_mju_user_warning(_be_quiet)
+        if mujoco.get_mju_user_warning() is None:
+            mujoco.set_mju_user_warning(_be_quiet)
         measured = np.empty((len(rows), self.num_measured), np.float32)
         displacement, first_quantity = self.splits[1], self.splits[1] + 1
         numbers = itertools.count()  # of the next row that no thread has taken; its steps are atomic
@@ -165,24 +169,36 @@ class _Threads:
     def __init__(self, num_threads: int):
         self.lock = threading.Lock()
         self.todo: list[queue.SimpleQueue] = [queue.SimpleQueue() for _ in range(num_threads - 1)]
-        self.done: queue.SimpleQueue = queue.SimpleQueue()
         for number, todo in enumerate(self.todo, start=1):
-            threading.Thread(target=self._serve, args=(number, todo), daemon=True, name=f"mujoco-{number}").start()
-
-    def _serve(self, number: int, todo: queue.SimpleQueue) -> None:
-        while True:
-            self.done.put(_error_of(todo.get(), number))
+            threading.Thread(target=_serve, args=(number, todo), daemon=True, name=f"mujoco-{number}").start()
 
     def run(self, work: Callable[[int], None], num_threads: int) -> None:
-        """Runs `work(0)` here, `work(1)`.. beside it; raises the first of their errors when all have ended."""
+        """Runs `work(0)` here, `work(1)`.. beside it; raises the first of their errors when all have ended.
+
+        An interrupt (Ctrl-C) waits for them too: they write into memory that the next call uses.
+        """
         with self.lock:
+            done: queue.SimpleQueue = queue.SimpleQueue()
             helpers = self.todo[: num_threads - 1]
             for todo in helpers:
-                todo.put(work)
-            errors = [_error_of(work, 0), *(self.done.get() for _ in helpers)]
+                todo.put((work, done))
+            errors = [_error_of(work, 0)]
+            running = len(helpers)
+            while running:
+                try:
+                    errors.append(done.get())
+                    running -= 1
+                except BaseException as interrupt:
+                    errors.append(interrupt)
         for error in errors:
             if error is not None:
                 raise error
+
+
+def _serve(number: int, todo: queue.SimpleQueue) -> None:
+    while True:
+        work, done = todo.get()
+        done.put(_error_of(work, number))
 
 
 def _error_of(work: Callable[[int], None], number: int) -> BaseException | None:
@@ -193,9 +209,22 @@ def _error_of(work: Callable[[int], None], number: int) -> BaseException | None:
     return None
 
 
-@cache
+_pools: dict[tuple[int, int], _Threads] = {}
+_pools_lock = threading.Lock()
+
+
 def _threads(num_threads: int) -> _Threads:
-    return _Threads(num_threads)
+    """The one pool of this size in this process: a forked child has none of its parent's threads."""
+    key = (os.getpid(), num_threads)
+    with _pools_lock:
+        if key not in _pools:
+            _pools[key] = _Threads(num_threads)
+        return _pools[key]
+
+
+def usable_cores() -> int:
+    """Cores that this process may use (macOS cannot tell: all)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _be_quiet(message: str) -> None:
