@@ -6,29 +6,32 @@ machine's speed changes with what else it does.
 """
 
 import dataclasses
-import functools
 import itertools
 import json
 import platform
-import statistics
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
 from experiments import runtime
-from sqt_jax import algorithms, envs, lap, replay, rollout, train
-from sqt_jax.types import Array, Transition
+from experiments.measure import (
+    REPLAYS,
+    Row,
+    bench_env,
+    bench_loop,
+    bench_physics,
+    bench_replay,
+    bench_update,
+)
+from sqt_jax import algorithms, envs
 
-SUITES = ("env", "update", "replay", "loop")
-BATCH = 256
+SUITES = ("env", "physics", "update", "replay", "loop")
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
@@ -40,157 +43,6 @@ flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite r
 flags.DEFINE_integer("repeats", 5, "Timed calls per figure; the median counts.", lower_bound=1)
 flags.DEFINE_float("seconds", 1.0, "About how long one timed call runs.", lower_bound=0.0)
 flags.DEFINE_string("json", "", "Also write the rows to this file.")
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One figure. `rate` counts the unit in all members together, per second."""
-
-    suite: str
-    what: str
-    members: int
-    unit: str
-    rate: float
-    compile_seconds: float
-
-
-def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
-    """Iterations per second of `run(iterations)` (median), and the seconds of the first call, which compiles."""
-
-    def timed(iterations: int) -> float:
-        start = time.perf_counter()
-        jax.block_until_ready(run(iterations))
-        return time.perf_counter() - start
-
-    compile_seconds = timed(1)
-    iterations = 1
-    while (elapsed := timed(iterations)) < seconds / 4:
-        iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
-    iterations = max(1, round(iterations * seconds / elapsed))
-    return statistics.median(iterations / timed(iterations) for _ in range(repeats)), compile_seconds
-
-
-def member_keys(members: int) -> Array:
-    return jax.vmap(jax.random.key)(jnp.arange(members))
-
-
-def bench_env(task: str, members: int, physics: str, **timing: Any) -> Row:
-    """Environment steps with random actions, automatic restarts included."""
-    env = envs.make(task, physics)
-
-    def step(timestep, key):
-        def policy(_):
-            return rollout.uniform_actions(key, 1, env.action_size)
-
-        return rollout.step(env, timestep, policy)[0]
-
-    @jax.jit
-    def run(timestep, keys, steps):
-        def body(i, timestep):
-            return jax.vmap(step)(timestep, jax.vmap(jax.random.fold_in, (0, None))(keys, i))
-
-        return jax.lax.fori_loop(0, steps, body, timestep)
-
-    keys = member_keys(members)
-    start = jax.jit(jax.vmap(lambda key: rollout.reset(env, key, 1)))(keys)
-    rate, compile_seconds = measure(lambda steps: run(start, keys, steps), **timing)
-    return Row("env", f"{task}, {physics}", members, "env steps", rate * members, compile_seconds)
-
-
-def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
-    """Updates on one fixed batch: the learner alone, without environment and replay."""
-    config = algorithms.make_config(algo, task)
-    env = envs.make(task)
-    agent = algorithms.agent_of(config, env)
-    size = config.train.batch_size
-
-    def random_batch(key):
-        obs, action, reward, next_obs = (
-            jax.random.normal(k, shape)
-            for k, shape in zip(
-                jax.random.split(key, 4),
-                [(size, env.observation_size), (size, env.action_size), (size,), (size, env.observation_size)],
-                strict=True,
-            )
-        )
-        return Transition(obs, jnp.tanh(action), reward, next_obs, jnp.ones(size))
-
-    example = jax.eval_shape(agent.init, jax.random.key(0))
-    axes = train.member_axes(example)
-    update = jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0))
-
-    @jax.jit
-    def run(state, batch, keys, steps):
-        def body(i, state):
-            return update(state, batch, jax.vmap(jax.random.fold_in, (0, None))(keys, i))[0]
-
-        return jax.lax.fori_loop(0, steps, body, state)
-
-    keys = member_keys(members)
-    state, batch = jax.jit(jax.vmap(agent.init, out_axes=axes))(keys), jax.vmap(random_batch)(keys)
-    rate, compile_seconds = measure(lambda steps: run(state, batch, keys, steps), **timing)
-    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds)
-
-
-REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}
-
-
-def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
-    """One insert of a row, or one sampled batch and what it feeds back, on a full buffer."""
-    env = envs.make(task)
-    store = REPLAYS[kind](capacity, BATCH, env.observation_size, env.action_size)
-    axes = train.member_axes(jax.eval_shape(store.init))
-    obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
-
-    def insert(state, total, key, step):
-        return store.insert(state, Transition(obs, action, scalar, obs, scalar)), total
-
-    def sample(state, total, key, step):
-        batch, rows = store.sample(state, key)
-        state = store.feedback(state, rows, jax.random.uniform(key, (BATCH,), maxval=3.0), step + 1)
-        return state, total + jnp.sum(batch.obs)
-
-    one = jax.vmap({"insert": insert, "sample": sample}[what], in_axes=(axes, 0, 0, None), out_axes=(axes, 0))
-
-    def loop(step_of, state, total, keys, steps):
-        def body(i, carry):
-            return step_of(*carry, jax.vmap(jax.random.fold_in, (0, None))(keys, i), i)
-
-        return jax.lax.fori_loop(0, steps, body, (state, total))
-
-    run = jax.jit(functools.partial(loop, one), donate_argnums=0)
-    fill = jax.jit(functools.partial(loop, jax.vmap(insert, in_axes=(axes, 0, 0, None), out_axes=(axes, 0))))
-    keys, total = member_keys(members), jnp.zeros(members)
-    state, _ = fill(jax.jit(jax.vmap(lambda _: store.init(), out_axes=axes))(keys), total, keys, capacity)
-
-    def once(steps):
-        nonlocal state
-        state, total = run(state, jnp.zeros(members), keys, steps)
-        return total
-
-    rate, compile_seconds = measure(once, **timing)
-    name = f"{kind} {what}, {task} rows, capacity {capacity:,}"
-    return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
-
-
-def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) -> Row:
-    """The whole training loop: environment step, insert, sample, update."""
-    config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
-    sweep = train.make_sweep(algorithms.make_trainer(config))
-    scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
-    state = sweep.init(member_keys(members), scalars)
-    start = time.perf_counter()
-    state = jax.block_until_ready(sweep.advance(state, 1, False))
-    compile_seconds = time.perf_counter() - start
-    state = sweep.advance(state, 299, False)
-
-    def once(steps):
-        nonlocal state
-        state = sweep.advance(state, steps, True)
-        return state.env_steps
-
-    rate, _ = measure(once, **timing)
-    return Row("loop", f"{algo} on {task}, {physics}", members, "env steps", rate * members, compile_seconds)
 
 
 def check_flags() -> None:
@@ -213,6 +65,9 @@ def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
         for count in members:
             if suite == "env":
                 yield from (bench_env(task, count, name, **timing) for task in tasks for name in physics)
+            elif suite == "physics":
+                for task in tasks:
+                    yield from bench_physics(task, count, **timing)
             elif suite == "update":
                 yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
             elif suite == "replay":
@@ -236,6 +91,18 @@ def machine() -> dict[str, Any]:
         cpu = f"{len(names)} x {names[0]}" if names else cpu
     device = jax.devices()[0]
     return {"cpu": cpu, "device": f"{device.platform}: {device.device_kind}", "jax": jax.__version__}
+
+
+def ratios(all_rows: Sequence[Row]) -> list[str]:
+    """What the suite physics is for: each physics against MuJoCo alone, and MJX against the file's settings."""
+    rates = {(r.what, r.members): r.rate for r in all_rows if r.suite == "physics"}
+    lines = []
+    for (what, members), rate in rates.items():
+        task, _, physics = what.partition(", ")
+        for reference in {"mujoco": "MuJoCo alone", "mjx": "mjx, the file's iterations"}.get(physics, "").splitlines():
+            ratio = rate / rates[f"{task}, {reference}", members]
+            lines.append(f"{task}, {members} members: {physics} / {reference} = {ratio:.2f}")
+    return lines
 
 
 def markdown(all_rows: Sequence[Row]) -> str:
@@ -263,6 +130,7 @@ def main(argv: Sequence[str]) -> None:
         table.add_row(r.suite, r.what, *cells)
     console.print(table)
     print(markdown(found))
+    print("\n".join(ratios(found)))
     if FLAGS.json:
         report = {"machine": machine(), "rows": [dataclasses.asdict(row) for row in found]}
         Path(FLAGS.json).write_text(json.dumps(report, indent=1) + "\n")

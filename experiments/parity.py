@@ -16,8 +16,9 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments import runtime
-from experiments.bench import bench_env, check_flags, machine
+from experiments.bench import check_flags, machine
 from experiments.gymnasium_reference import Episode, episode, recorded
+from experiments.measure import bench_env
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 from sqt_jax.types import Environment

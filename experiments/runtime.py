@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 # XLA's CPU backend compiles loops over little data into one function each. Its own limit leaves MJX's solver loops out,
-# whose many small kernels are then dispatched one by one (measured: BUILD_NOTES.md).
+# whose many small kernels are then dispatched one by one.
 SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 SMALL_LOOP_BYTES = 1_000_000
 

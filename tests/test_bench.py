@@ -8,32 +8,14 @@ from absl.testing import flagsaver
 
 from experiments import bench
 
-SHORT = {"seconds": 0.0, "repeats": 1}
 
-
-def test_a_rate_is_iterations_per_second(monkeypatch):
-    now = 0.0
-
-    def run(iterations):
-        nonlocal now
-        now += 0.25 * iterations + (5 if iterations == 1 and now == 0 else 0)
-
-    monkeypatch.setattr(bench.time, "perf_counter", lambda: now)
-    assert bench.measure(run, seconds=10, repeats=3) == (4.0, 5.25)
-
-
-@pytest.mark.parametrize("kind", bench.REPLAYS)
-@pytest.mark.parametrize("what", ["insert", "sample"])
-def test_a_replays_row_names_what_was_measured(kind, what):
-    row = bench.bench_replay(kind, what, "cheetah", 300, 2, **SHORT)
-    assert (row.suite, row.what) == ("replay", f"{kind} {what}, cheetah rows, capacity 300")
-    assert (row.members, row.unit) == (2, f"{what}s") and row.rate > 0
-
-
-def test_an_updates_row_counts_the_updates_of_all_members():
-    row = bench.bench_update("td7_sqt", "cheetah", 2, **SHORT)
-    assert (row.suite, row.what, row.members) == ("update", "td7_sqt, cheetah sizes", 2)
-    assert row.unit == "member updates" and row.rate > 0
+def test_ratios_are_those_of_one_task_and_number_of_members():
+    rates = {"MuJoCo alone": 100.0, "mujoco": 90.0, "mjx": 50.0, "mjx, the file's iterations": 20.0}
+    rows = [bench.Row("physics", f"ant, {what}", 5, "env steps", rate, 0.0) for what, rate in rates.items()]
+    assert bench.ratios(rows) == [
+        "ant, 5 members: mujoco / MuJoCo alone = 0.90",
+        "ant, 5 members: mjx / mjx, the file's iterations = 2.50",
+    ]
 
 
 def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):

@@ -1,0 +1,229 @@
+"""The measurements of the benchmark: how fast one part is, compiled as it is used."""
+
+import concurrent.futures
+import dataclasses
+import functools
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import rollout as rollout_c
+
+from sqt_jax import algorithms, envs, lap, replay, rollout, train
+from sqt_jax.envs import gym_table, gym_tasks
+from sqt_jax.envs.physics import mujoco_c
+from sqt_jax.types import Array, Transition
+
+BATCH = 256
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One figure. `rate` counts the unit in all members together, per second."""
+
+    suite: str
+    what: str
+    members: int
+    unit: str
+    rate: float
+    compile_seconds: float
+
+
+def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
+    """Iterations per second of `run(iterations)` (median), and the seconds of the first call, which compiles."""
+
+    def timed(iterations: int) -> float:
+        start = time.perf_counter()
+        jax.block_until_ready(run(iterations))
+        return time.perf_counter() - start
+
+    compile_seconds = timed(1)
+    iterations = 1
+    while (elapsed := timed(iterations)) < seconds / 4:
+        iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
+    iterations = max(1, round(iterations * seconds / elapsed))
+    return statistics.median(iterations / timed(iterations) for _ in range(repeats)), compile_seconds
+
+
+def member_keys(members: int) -> Array:
+    return jax.vmap(jax.random.key)(jnp.arange(members))
+
+
+def bench_env(task: str, members: int, physics: str, *, seconds: float, repeats: int, **options: Any) -> Row:
+    """Environment steps with random actions, automatic restarts included."""
+    env = envs.make(task, physics, **options)
+
+    def step(timestep, key):
+        def policy(_):
+            return rollout.uniform_actions(key, 1, env.action_size)
+
+        return rollout.step(env, timestep, policy)[0]
+
+    @jax.jit
+    def run(timestep, keys, steps):
+        def body(i, timestep):
+            return jax.vmap(step)(timestep, jax.vmap(jax.random.fold_in, (0, None))(keys, i))
+
+        return jax.lax.fori_loop(0, steps, body, timestep)
+
+    keys = member_keys(members)
+    start = jax.jit(jax.vmap(lambda key: rollout.reset(env, key, 1)))(keys)
+    rate, compile_seconds = measure(lambda steps: run(start, keys, steps), seconds, repeats)
+    return Row("env", f"{task}, {physics}", members, "env steps", rate * members, compile_seconds)
+
+
+def bench_bare(task: str, members: int, **timing: Any) -> Row:
+    """The same control steps by MuJoCo alone, without JAX and without restarts, on as many threads.
+
+    `mujoco.rollout` gives no contact forces: for the humanoid, a thread pool makes the calls one robot at a time.
+    """
+    row = gym_table.TASKS[task]
+    model = gym_tasks.load_model(row)
+    threads = mujoco_c.usable_cores()
+    data = [mujoco.MjData(model) for _ in range(max(members, threads))]
+    generator = np.random.default_rng(0)
+    low, high = model.actuator_ctrlrange.T
+
+    def control() -> np.ndarray:
+        return generator.uniform(low, high, (members, model.nu))
+
+    if row.quantities:
+        pool = concurrent.futures.ThreadPoolExecutor(threads)
+
+        def one(robot: mujoco.MjData, ctrl: np.ndarray) -> None:
+            robot.ctrl[:] = ctrl
+            mujoco.mj_step(model, robot, nstep=row.frame_skip)
+            mujoco.mj_rnePostConstraint(model, robot)
+
+        def step() -> None:
+            list(pool.map(one, data[:members], control()))
+
+    else:
+        full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.zeros((members, mujoco.mj_stateSize(model, full)))
+        for row_of, robot in zip(state, data, strict=False):
+            mujoco.mj_getState(model, robot, row_of, full)
+        rollouts = rollout_c.Rollout(nthread=threads)
+
+        def step() -> None:
+            controls = np.repeat(control()[:, None], row.frame_skip, axis=1)
+            states, _ = rollouts.rollout(model, data[:threads], state, controls)
+            state[:] = states[:, -1]
+
+    def run(steps: int) -> None:
+        for _ in range(steps):
+            step()
+
+    rate, _ = measure(run, **timing)
+    return Row("physics", f"{task}, MuJoCo alone", members, "env steps", rate * members, 0.0)
+
+
+def bench_physics(task: str, members: int, **timing: Any) -> Iterator[Row]:
+    """One task on each physics, beside MuJoCo alone and MJX with the model file's solver settings."""
+    yield bench_bare(task, members, **timing)
+    cases: dict[str, dict[str, Any]] = {name: {} for name in envs.PHYSICS}
+    cases["mjx, the file's iterations"] = {"iterations": None, "ls_iterations": None}
+    for what, options in cases.items():
+        row = bench_env(task, members, what.split(",")[0], **options, **timing)
+        yield dataclasses.replace(row, suite="physics", what=f"{task}, {what}")
+
+
+def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
+    """Updates on one fixed batch: the learner alone, without environment and replay."""
+    config = algorithms.make_config(algo, task)
+    env = envs.make(task)
+    agent = algorithms.agent_of(config, env)
+    size = config.train.batch_size
+
+    def random_batch(key):
+        obs, action, reward, next_obs = (
+            jax.random.normal(k, shape)
+            for k, shape in zip(
+                jax.random.split(key, 4),
+                [(size, env.observation_size), (size, env.action_size), (size,), (size, env.observation_size)],
+                strict=True,
+            )
+        )
+        return Transition(obs, jnp.tanh(action), reward, next_obs, jnp.ones(size))
+
+    example = jax.eval_shape(agent.init, jax.random.key(0))
+    axes = train.member_axes(example)
+    update = jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0))
+
+    @jax.jit
+    def run(state, batch, keys, steps):
+        def body(i, state):
+            return update(state, batch, jax.vmap(jax.random.fold_in, (0, None))(keys, i))[0]
+
+        return jax.lax.fori_loop(0, steps, body, state)
+
+    keys = member_keys(members)
+    state, batch = jax.jit(jax.vmap(agent.init, out_axes=axes))(keys), jax.vmap(random_batch)(keys)
+    rate, compile_seconds = measure(lambda steps: run(state, batch, keys, steps), **timing)
+    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds)
+
+
+REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}
+
+
+def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
+    """One insert of a row, or one sampled batch and what it feeds back, on a full buffer."""
+    env = envs.make(task)
+    store = REPLAYS[kind](capacity, BATCH, env.observation_size, env.action_size)
+    axes = train.member_axes(jax.eval_shape(store.init))
+    obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
+
+    def insert(state, total, key, step):
+        return store.insert(state, Transition(obs, action, scalar, obs, scalar)), total
+
+    def sample(state, total, key, step):
+        batch, rows = store.sample(state, key)
+        state = store.feedback(state, rows, jax.random.uniform(key, (BATCH,), maxval=3.0), step + 1)
+        return state, total + jnp.sum(batch.obs)
+
+    one = jax.vmap({"insert": insert, "sample": sample}[what], in_axes=(axes, 0, 0, None), out_axes=(axes, 0))
+
+    def loop(step_of, state, total, keys, steps):
+        def body(i, carry):
+            return step_of(*carry, jax.vmap(jax.random.fold_in, (0, None))(keys, i), i)
+
+        return jax.lax.fori_loop(0, steps, body, (state, total))
+
+    run = jax.jit(functools.partial(loop, one), donate_argnums=0)
+    fill = jax.jit(functools.partial(loop, jax.vmap(insert, in_axes=(axes, 0, 0, None), out_axes=(axes, 0))))
+    keys, total = member_keys(members), jnp.zeros(members)
+    state, _ = fill(jax.jit(jax.vmap(lambda _: store.init(), out_axes=axes))(keys), total, keys, capacity)
+
+    def once(steps):
+        nonlocal state
+        state, total = run(state, jnp.zeros(members), keys, steps)
+        return total
+
+    rate, compile_seconds = measure(once, **timing)
+    name = f"{kind} {what}, {task} rows, capacity {capacity:,}"
+    return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
+
+
+def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) -> Row:
+    """The whole training loop: environment step, insert, sample, update."""
+    config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
+    sweep = train.make_sweep(algorithms.make_trainer(config))
+    scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
+    state = sweep.init(member_keys(members), scalars)
+    start = time.perf_counter()
+    state = jax.block_until_ready(sweep.advance(state, 1, False))
+    compile_seconds = time.perf_counter() - start
+    state = sweep.advance(state, 299, False)
+
+    def once(steps):
+        nonlocal state
+        state = sweep.advance(state, steps, True)
+        return state.env_steps
+
+    rate, _ = measure(once, **timing)
+    return Row("loop", f"{algo} on {task}, {physics}", members, "env steps", rate * members, compile_seconds)
