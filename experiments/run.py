@@ -3,6 +3,7 @@
 Exit codes: 0 done; 2 bad usage (one line, nothing written); 3 a member diverged; 130 interrupted.
 """
 
+import os
 import re
 import signal
 import sys
@@ -161,7 +162,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
 
 @contextmanager
 def _stop_on_signal() -> Iterator[list[int]]:
-    """Gathers SIGINT and SIGTERM in a list instead of dying of the first; a second one does what it always does."""
+    """Gathers SIGINT and SIGTERM in a list instead of dying of the first; a second one ends the process at once."""
     received: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
@@ -171,8 +172,10 @@ def _stop_on_signal() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
     def handle(number: int, _: FrameType | None) -> None:
+        if received:
+            # Not by an exception: it could strike inside a callback of the compiled program.
+            os._exit(INTERRUPTED)
         received.append(number)
-        restore()
         print("stopping when the running chunk of training or evaluation ends", file=sys.stderr)
 
     for number in numbers:

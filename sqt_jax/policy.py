@@ -2,6 +2,8 @@
 
 policy/config.json     settings and sizes
 policy/member_0.npz    what acting needs of member 0, by path ("params/layer0/kernel")
+policy/act.stablehlo   the function (arrays of a member, obs [B, O]) -> action [B, A], any B, by `jax.export`: it runs
+                       where this package is not installed
 """
 
 import json
@@ -10,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 
 from sqt_jax.algorithms import ALGORITHMS, agent_of, make_config
 from sqt_jax.config import Config
-from sqt_jax.types import Array, Environment, Params, State
+from sqt_jax.types import Agent, Array, Environment, Params, State
 
 
 def save_policy(directory: Path | str, config: Config, env: Environment, agent_state: State) -> None:
@@ -28,7 +31,9 @@ def save_policy(directory: Path | str, config: Config, env: Environment, agent_s
     directory.mkdir(parents=True)
     sizes = {"observation_size": env.observation_size, "action_size": env.action_size}
     (directory / "config.json").write_text(json.dumps(config.flat() | sizes, indent=1) + "\n")
-    arrays = _by_path(jax.device_get(agent_of(config, env).policy(agent_state)))
+    agent = agent_of(config, env)
+    arrays = _by_path(jax.device_get(agent.policy(agent_state)))
+    (directory / "act.stablehlo").write_bytes(_exported(agent, env.observation_size))
     for member in range(next(iter(arrays.values())).shape[0]):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
 
@@ -58,6 +63,20 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
         return agent.policy_action(params, jnp.asarray(obs, jnp.float32))
 
     return policy
+
+
+def _exported(agent: Agent, observation_size: int) -> bytes:
+    """The policy as a function of its arrays by path and of the observations, serialised."""
+    policy = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
+
+    def act(arrays: dict[str, Array], obs: Array) -> Array:
+        params = jax.tree.unflatten(jax.tree.structure(policy), [arrays[name] for name in _by_path(policy)])
+        return agent.policy_action(params, obs)
+
+    (batch,) = jax.export.symbolic_shape("batch")
+    obs = jax.ShapeDtypeStruct((batch, observation_size), jnp.float32)
+    exported = jax.export.export(jax.jit(act), platforms=("cpu", "cuda", "tpu"))(_by_path(policy), obs)
+    return bytes(exported.serialize())
 
 
 def _by_path(tree: Params) -> dict[str, Any]:

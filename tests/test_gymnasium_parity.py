@@ -4,7 +4,6 @@ On MuJoCo C whole episodes are equal, to float32; on MJX single control steps ar
 """
 
 import gymnasium
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from gym_reference import MJX_TASKS, environment, ours, recorded
 from scipy import stats
 
 from experiments.gymnasium_reference import episode, gymnasium_environment
+from experiments.parity import EPISODES, compare_episodes
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 from sqt_jax.evaluate import evaluate_policy
@@ -34,31 +34,10 @@ def name(request):
 @pytest.mark.parametrize("name", TASKS)
 def test_whole_episodes_on_mujoco_are_gymnasiums(name):
     """Actions of all sizes, and small ones, with which more robots stay healthy for long."""
-    env = envs.make(name, "mujoco")
-
-    @jax.jit
-    def play(start, actions):
-        def step(timestep, action):
-            timestep = env.step(timestep, action)
-            return timestep, (timestep.final_obs, timestep.reward, timestep.terminated)
-
-        return jax.lax.scan(step, start, actions)[1]
-
-    steps = 0
-    for seed, scale in enumerate([1.0, 0.3, 0.05]):
-        theirs = episode(name, seed, scale)
-        start = env.set_physics(theirs.qpos, theirs.qvel)
-        close = {"rtol": 1e-5, "atol": 1e-5}
-        np.testing.assert_allclose(start.obs, theirs.first_obs, **close)
-        actions = np.zeros((1000, env.action_size), np.float32)  # one compilation for all lengths
-        length = len(theirs.actions)
-        actions[:length] = theirs.actions
-        obs, reward, terminated = play(start, actions)
-        np.testing.assert_allclose(obs[:length], theirs.obs, **close)
-        np.testing.assert_allclose(reward[:length], theirs.reward, **close)
-        np.testing.assert_array_equal(terminated[:length], theirs.terminated)
-        steps += length
-    assert steps >= 80  # the humanoid falls within 30, whatever it does
+    found = compare_episodes(envs.make(name, "mujoco"), [episode(name, *case) for case in EPISODES])
+    assert found.obs <= 1e-5 and found.reward <= 1e-5  # |error| <= 1e-5 + 1e-5 |x|
+    assert found.terminations_agree
+    assert found.steps >= 80  # the humanoid falls within 30, whatever it does
 
 
 @pytest.mark.parametrize("name", ["walker", "hopper", "humanoid", pytest.param("ant", marks=pytest.mark.slow)])

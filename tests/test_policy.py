@@ -1,6 +1,8 @@
 """A saved policy acts as the agent that it was saved from, and loading refuses what does not fit."""
 
 import json
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -60,3 +62,23 @@ def test_a_missing_member_is_named(tmp_path):
     saved("td3", tmp_path / "policy")
     with pytest.raises(FileNotFoundError, match="member_7"):
         policy.load_policy(tmp_path / "policy", member=7)
+
+
+ELSEWHERE = """
+import pathlib, sys
+import jax, jax.export
+import numpy as np
+act = jax.export.deserialize(pathlib.Path("policy/act.stablehlo").read_bytes())
+obs = np.linspace(-1, 1, 6, dtype=np.float32).reshape(3, 2)
+np.save("action.npy", act.call(dict(np.load("policy/member_1.npz")), obs))
+assert "sqt_jax" not in sys.modules and "flax" not in sys.modules
+"""
+
+
+@pytest.mark.parametrize("algo", ["td3", "sac_sqt", "td7"])
+def test_the_exported_policy_runs_without_this_package(algo, tmp_path):
+    saved(algo, tmp_path / "policy")
+    subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=tmp_path, check=True, timeout=120)
+    obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
+    expected = policy.load_policy(tmp_path / "policy", 1)(obs)
+    np.testing.assert_allclose(np.load(tmp_path / "action.npy"), expected, rtol=1e-5, atol=1e-6)

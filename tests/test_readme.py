@@ -42,13 +42,16 @@ def test_a_policy_of_a_run_loads_as_shown(tmp_path):
     argv += ["--hidden=8", "--eval_every=60", "--eval_episodes=1", f"--out={tmp_path}", "--name=tiny", "--quiet"]
     assert run.main([*argv, "--physics=mujoco"]) == 0
     import gymnasium
+    import jax.export
     import jax.numpy as jnp
+    import numpy
 
     import sqt_jax
 
     path = tmp_path / "cheetah" / "td3" / "tiny"
     names = {"run": path, "obs": jnp.zeros((4, 17)), "sqt_jax": sqt_jax, "gymnasium": gymnasium}
-    (code,) = [code for _, continued, code in BLOCKS if continued]
-    exec(code, names)
+    names |= {"jax": jax, "numpy": numpy}
+    for code in [code for _, continued, code in BLOCKS if continued]:
+        exec(code, names)
     assert names["action"].shape == (4, 6)
     assert names["lengths"].tolist() == [1000, 1000]

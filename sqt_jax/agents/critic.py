@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from sqt_jax import q_targets
+from sqt_jax import losses, q_targets
 from sqt_jax.config import AgentConfig
+from sqt_jax.networks import Network
 from sqt_jax.optimizers import adam_step
 from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
 
@@ -107,3 +108,22 @@ def update(
         "penalty": jnp.mean(terms["penalty"]),
     }
     return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics
+
+
+def update_by_squares(
+    critic_net: Network,
+    config: AgentConfig,
+    state: AgentState,
+    batch: Transition,
+    target: Array,
+    terms: dict[str, Array],
+) -> tuple[AgentState, Array, Metrics]:
+    """`update` of critics of (obs, action) alone, on the mean squared error."""
+    return update(
+        lambda params: critic_net.apply(params, batch.obs, batch.action),
+        lambda q: losses.critic_loss(q, target),
+        config,
+        state,
+        target,
+        terms,
+    )

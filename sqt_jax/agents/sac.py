@@ -115,14 +115,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
 
     def update_critic(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
         target, terms = td_target(state, batch, noise)
-        return critics.update(
-            lambda params: critic_net.apply(params, batch.obs, batch.action),
-            lambda q: losses.critic_loss(q, target),
-            config,
-            state,
-            target,
-            terms,
-        )
+        return critics.update_by_squares(critic_net, config, state, batch, target, terms)
 
     def update_actor(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Metrics]:
         def loss_fn(actor):

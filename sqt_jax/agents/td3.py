@@ -117,14 +117,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
 
     def update_critic(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array, Metrics]:
         target, terms = td_target(state, batch, noise)
-        return critics.update(
-            lambda params: critic_net.apply(params, batch.obs, batch.action),
-            lambda q: losses.critic_loss(q, target),
-            config,
-            state,
-            target,
-            terms,
-        )
+        return critics.update_by_squares(critic_net, config, state, batch, target, terms)
 
     def update_actor(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array]:
         def loss_fn(actor):
