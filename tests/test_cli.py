@@ -11,6 +11,7 @@ import numpy as np
 import probe_envs
 import pytest
 
+import experiments.run
 from experiments import records
 from experiments.run import main
 from sqt_jax.algorithms import make_config
@@ -193,6 +194,16 @@ def test_an_interrupted_run_keeps_what_it_has(tmp_path, monkeypatch, number):
     assert summary["status"] == "interrupted" and summary["env_steps"] == 50
     assert len(rows_of(path / "evaluations.csv")) == 8
     assert (path / "curves.png").exists()
+
+
+def test_a_second_signal_ends_the_process_at_once(monkeypatch):
+    codes = []
+    monkeypatch.setattr(experiments.run.os, "_exit", codes.append)
+    with experiments.run._stop_on_signal() as received:
+        signal.raise_signal(signal.SIGTERM)
+        assert received == [signal.SIGTERM] and codes == []
+        signal.raise_signal(signal.SIGINT)
+        assert codes == [130]
 
 
 def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
