@@ -10,8 +10,10 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
 
+import yaml
 from absl import flags as absl_flags
 
 from experiments.presets import PRESETS
@@ -22,6 +24,7 @@ from sqt_jax.types import Scalars
 EXAMPLE = "python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4"
 DEFAULT_SEEDS = (0, 1, 2, 3, 4)
 MAX_SEED = 2**32 - 1
+MAX_CONFIG_BYTES = 100_000
 
 # What each setting is, for --help: a new field of the configuration becomes a flag by itself and wants a line here.
 SETTING_HELP = {
@@ -89,6 +92,7 @@ class Options(NamedTuple):
     preset: str
     out: str
     name: str | None
+    overwrite: bool
     tensorboard: bool
     quiet: bool
 
@@ -184,6 +188,7 @@ FLAGS: dict[str, list[_Flag]] = {
             ",".join(map(str, DEFAULT_SEEDS)),
         ),
         _Flag("preset", str, f"one of {', '.join(PRESETS)}", "bundle of settings; flags win over it", "paper"),
+        _Flag("config", str, "a file", "YAML file of flags without the dashes; it wins over the preset", "none"),
     ],
     "Training": _settings(TrainConfig),
     "Algorithm (the scalars " + ", ".join(Scalars._fields) + " take lists)": [
@@ -194,6 +199,7 @@ FLAGS: dict[str, list[_Flag]] = {
     "Output": [
         _Flag("out", str, "a folder", "results go to OUT/ENV/ALGO/NAME/", "runs"),
         _Flag("name", str, "a word", "name of the run", "settings that differ from the defaults, and the time"),
+        _Flag("overwrite", None, "true or false", "replace a run of the same name", "false"),
         _Flag("tensorboard", None, "true or false", "also write TensorBoard events", "true"),
         _Flag("quiet", None, "true or false", "print errors only", "false"),
         _Flag("help", None, "true or false", "this text", ""),
@@ -243,6 +249,40 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     return {flag.name: values[flag.name].value for flag in known if values[flag.name].present}
 
 
+def _file_values(name: str) -> dict[str, Any]:
+    """The flags of a YAML file, parsed as those of a command line."""
+
+    def refuse(message: str) -> NoReturn:
+        raise UsageError(f"--config={name}: {message}")
+
+    path = Path(name)
+    try:
+        if not path.is_file():
+            refuse("takes a file, which this is not" if path.exists() else "there is no such file")
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            refuse(f"takes a file of at most {MAX_CONFIG_BYTES} bytes")
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
+        refuse("takes a YAML file, which this is not")
+    except OSError as error:
+        refuse(f"cannot be read: {error.strerror}")
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        refuse("takes lines like `steps: 100000`")
+    arguments = []
+    for key, value in content.items():
+        if key in ("config", "help"):
+            refuse(f"{key} is for the command line")
+        items = value if isinstance(value, list) else [value]
+        if not items or not all(isinstance(item, bool | int | float | str) for item in items):
+            refuse(f"{key} takes a number, a word or a list of them")
+        words = [str(item).lower() if isinstance(item, bool) else str(item) for item in items]
+        arguments.append(f"--{key}={','.join(words)}")
+    try:
+        return _values(["", *arguments])
+    except UsageError as error:
+        raise UsageError(f"{error} (in {name})") from None
+
+
 def parse(argv: Sequence[str]) -> Options | None:
     """A command line (program name first) as `Options`; None where it asks for help.
 
@@ -252,6 +292,8 @@ def parse(argv: Sequence[str]) -> Options | None:
     if any(word in ("--help", "-help", "--h", "-h", "-?") for word in given):
         return None
     values = _values(argv)
+    if "config" in values:
+        values = _file_values(values.pop("config")) | values
     own = {name: values.pop(name, None) for name in ("algo", "env", "seeds", "preset", "out", "name")}
     for required in ("algo", "env"):
         if not own[required]:
@@ -274,6 +316,7 @@ def parse(argv: Sequence[str]) -> Options | None:
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
     tensorboard, quiet = values.pop("tensorboard", True), values.pop("quiet", False)
+    overwrite = values.pop("overwrite", False)
     if values.get("temperature") == "auto":
         del values["temperature"]
         settings["learn_temperature"] = True
@@ -299,6 +342,7 @@ def parse(argv: Sequence[str]) -> Options | None:
         preset=preset,
         out=own["out"] or "runs",
         name=name,
+        overwrite=overwrite,
         tensorboard=tensorboard,
         quiet=quiet,
     )

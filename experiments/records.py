@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -70,6 +71,29 @@ def score(returns: np.ndarray) -> Score | None:
 
 class RunExists(Exception):
     """The run directory already holds a run."""
+
+
+# What a run leaves: nothing else is ever removed.
+RUN_FILES = ("config.json", "evaluations.csv", "metrics.csv", "summary.json", "summary.json.part", "curves.png")
+RUN_FOLDERS = ("policy", "tensorboard")
+
+
+def remove_run(path: Path) -> None:
+    """Removes the files of the run in `path`, if there is one, and leaves all else alone.
+
+    Raises:
+      RunExists: there are other files too, or it is not a folder of its own but a link.
+      OSError: a file cannot be removed.
+    """
+    if not path.exists():
+        return
+    names = {item.name for item in path.iterdir()}
+    if path.is_symlink() or any((path / name).is_symlink() for name in names) or names - {*RUN_FILES, *RUN_FOLDERS}:
+        raise RunExists
+    for name in names & {*RUN_FOLDERS}:
+        shutil.rmtree(path / name)
+    for name in names & {*RUN_FILES}:
+        (path / name).unlink()
 
 
 class Records:

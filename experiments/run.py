@@ -71,7 +71,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     members = make_members(options.seeds, configs)
     path = Path(options.out) / default.env / default.algo / (options.name or _default_name(options))
     try:
-        if path.is_dir() and any(path.iterdir()):
+        if path.is_dir() and any(path.iterdir()) and not options.overwrite:
             raise flags.UsageError(_taken(path))
     except OSError as error:
         raise flags.UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
@@ -99,6 +99,8 @@ def run(plan: Plan, command: Sequence[str]) -> int:
     train = config.train
     console = Console()
     try:
+        if options.overwrite:
+            records.remove_run(plan.path)
         files = records.Records(plan.path, members, plan.swept, options.tensorboard)
     except records.RunExists:
         raise flags.UsageError(_taken(plan.path)) from None
@@ -197,7 +199,7 @@ def _default_name(options: flags.Options) -> str:
 
 
 def _taken(path: Path) -> str:
-    return f"--name={path.name}: {path} already holds a run; takes another name"
+    return f"--name={path.name}: {path} already holds a run; takes another name, or --overwrite replaces it"
 
 
 def _free_memory() -> int:

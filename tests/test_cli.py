@@ -196,6 +196,21 @@ def test_an_interrupted_run_keeps_what_it_has(tmp_path, monkeypatch, number):
     assert (path / "curves.png").exists()
 
 
+def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsys):
+    path = tmp_path / "ant" / "sac_sqt" / "run"
+    path.mkdir(parents=True)
+    (path / "config.json").write_text("old")
+    assert run(tmp_path) == 2
+    assert "already holds a run; takes another name, or --overwrite replaces it" in capsys.readouterr().err
+    assert (path / "config.json").read_text() == "old"
+    (path / "thesis.tex").write_text("mine")
+    assert run(tmp_path, "--overwrite") == 2
+    assert capsys.readouterr().err.count("\n") == 1 and (path / "config.json").read_text() == "old"
+    (path / "thesis.tex").unlink()
+    assert run(tmp_path, "--overwrite", "--penalty_coef=0,0.5") == 0
+    assert json.loads((path / "config.json").read_text())["settings"]["algo"] == "sac_sqt"
+
+
 def test_a_second_signal_ends_the_process_at_once(monkeypatch):
     codes = []
     monkeypatch.setattr(experiments.run.os, "_exit", codes.append)

@@ -1,4 +1,5 @@
 import dataclasses
+import os
 import re
 import subprocess
 import sys
@@ -156,3 +157,67 @@ def test_reading_the_command_line_imports_nothing_heavy():
     code = f"import sys, experiments.run; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout == "[]\n"
+
+
+# Settings from a file
+
+
+def write(tmp_path, text):
+    path = tmp_path / "settings.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_a_file_gives_flags_and_the_command_line_wins(tmp_path):
+    path = write(
+        tmp_path,
+        "algo: sac_sqt\nenv: ant\nsteps: 1e5\nhidden: [64, 32]\nseeds: [3, 1]\ntemperature: auto\n"
+        "penalty_coef: [0, 0.5]\npenalty_inside_gamma: false\nquiet: yes\n",
+    )
+    options = flags.parse(["run", f"--config={path}", "--env=walker", "--steps=200"])
+    assert (options.algo, options.env, options.seeds, options.quiet) == ("sac_sqt", "walker", (3, 1), True)
+    assert options.settings == {
+        "steps": 200,
+        "hidden": (64, 32),
+        "penalty_inside_gamma": False,
+        "learn_temperature": True,
+    }
+    assert options.sweep == {"penalty_coef": (0.0, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepz: 5", "--stepz: unknown flag; did you mean --steps? (in "),
+        ("steps: two", "--steps=two: takes a whole number (in "),
+        ("steps: [5", "takes a YAML file, which this is not"),
+        ("- steps", "takes lines like `steps: 100000`"),
+        ("5: 6", "takes lines like `steps: 100000`"),
+        ("", "takes lines like `steps: 100000`"),
+        ("steps: {a: 5}", "steps takes a number, a word or a list of them"),
+        ("steps:", "steps takes a number, a word or a list of them"),
+        ("seeds: []", "seeds takes a number, a word or a list of them"),
+        ("config: other.yaml", "config is for the command line"),
+        ("steps: !!python/object/apply:os.system ['true']", "takes a YAML file, which this is not"),
+        ("a: &a [x, x]\nb: &b [*a, *a]\nseeds: [*b, *b]", "b takes a number, a word"),
+        (b"\xff\xfe\x00", "takes a YAML file, which this is not"),
+        ("[" * 5000, "takes a YAML file, which this is not"),
+        ("#" * 200_000, "takes a file of at most 100000 bytes"),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
+    path = write(tmp_path, text)
+    with pytest.raises(flags.UsageError) as error:
+        flags.parse(["run", f"--config={path}", "--algo=td3", "--env=ant"])
+    line = str(error.value)
+    assert message in line and "\n" not in line
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    cases = {tmp_path: "which this is not", tmp_path / "none.yaml": "no such file", fifo: "which this is not"}
+    for path, message in cases.items():
+        with pytest.raises(flags.UsageError, match=message):
+            flags.parse(["run", f"--config={path}", "--algo=td3", "--env=ant"])

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from experiments import records
 from experiments.loop import Outcome, Report
 from experiments.records import (
     EVALUATION_COLUMNS,
@@ -207,3 +208,32 @@ def test_default_name_tells_what_differs():
     name = default_name({"preset": "quick", "hidden": (64, 32), "lr": 0.001, "seeds": (0, 1)}, now)
     assert name == "preset=quick_hidden=64+32_lr=0.001_seeds=0+1_20250102T030405Z"
     assert len(default_name({"seeds": tuple(range(1000))}, now)) < 200
+
+
+def test_only_a_runs_own_files_are_removed(tmp_path):
+    path = tmp_path / "run"
+    records.remove_run(path)  # nothing there
+    (path / "policy").mkdir(parents=True)
+    for name in ("config.json", "evaluations.csv", "policy/member_0.npz"):
+        (path / name).write_text("x")
+    records.remove_run(path)
+    assert path.exists() and not any(path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["foreign file", "link", "linked folder"])
+def test_what_is_not_only_a_run_is_left_alone(tmp_path, kind):
+    path, other = tmp_path / "run", tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("x")
+    if kind == "link":
+        path.symlink_to(other)
+    else:
+        path.mkdir()
+        (path / "config.json").write_text("x")
+        if kind == "foreign file":
+            (path / "thesis.tex").write_text("x")
+        else:
+            (path / "policy").symlink_to(other)
+    with pytest.raises(records.RunExists):
+        records.remove_run(path)
+    assert (other / "thesis.tex").exists() and (kind == "link" or (path / "config.json").exists())
