@@ -28,11 +28,6 @@ def environment(name: str) -> Environment:
 
 
 @cache
-def compiled_reset(name: str):
-    return jax.jit(jax.vmap(environment(name).reset))
-
-
-@cache
 def compiled_step(name: str):
     return jax.jit(jax.vmap(environment(name).step))
 

@@ -316,7 +316,15 @@ def test_a_sampled_actor_acts_by_its_mode_and_learns_from_its_samples():
     assert subject("td3").agent.draw_noise(KEY, batch).action_eps is None
 
 
-@pytest.mark.parametrize(("algo", "n"), [("td3_sqt", 3), ("sac_sqt_tuple", 2), ("redq_sqt", 10), ("maxmin_sqt", 4)])
+@pytest.mark.parametrize(
+    ("algo", "n"),
+    [
+        ("td3_sqt", 3),
+        ("redq_sqt", 10),
+        pytest.param("sac_sqt_tuple", 2, marks=pytest.mark.slow),
+        pytest.param("maxmin_sqt", 4, marks=pytest.mark.slow),
+    ],
+)
 def test_with_sale_networks_updates_are_finite_and_coefficient_0_is_the_plain_algorithm(algo, n):
     sale = {"networks": "sale", "ensemble_size": n}
     base = subject(base_of(algo), **sale)

@@ -65,10 +65,10 @@ def test_the_time_limit_truncates(pendulum):
     assert step(late, jnp.zeros(1)).truncated and not step(timestep, jnp.zeros(1)).truncated
 
 
-SLOW = pytest.param("mjx", marks=pytest.mark.slow)
+SLOW = {name: pytest.param(name, marks=pytest.mark.slow) for name in ("mjx", "generalized")}
 
 
-@pytest.mark.parametrize("physics", [SLOW if name == "mjx" else name for name in PIPELINES])
+@pytest.mark.parametrize("physics", [SLOW.get(name, name) for name in PIPELINES])
 def test_every_pipeline_makes_steps_and_is_compiled_once(physics):
     env = envs.make(NAME, physics)
     assert (env.observation_size, env.action_size, env.name) == (4, 1, NAME)
@@ -92,6 +92,7 @@ def test_every_name_steps_on_all_that_it_says_can_compute_it(name):
         assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, timestep)
 
 
+@pytest.mark.slow
 def test_a_run_trains_on_brax(tmp_path):
     argv = ["run", "--algo=td3_sqt", f"--env={NAME}", "--physics=spring", "--steps=60", "--warmup_steps=20"]
     argv += ["--eval_every=60", "--eval_episodes=1", "--hidden=8", "--batch_size=8", f"--out={tmp_path}", "--name=tiny"]

@@ -125,7 +125,10 @@ def test_a_directory_that_holds_a_run_is_refused(finished, capsys):
     path = finished[1]
     before = {item: item.stat().st_mtime_ns for item in path.rglob("*")}
     assert run(path.parents[2]) == 2
-    assert capsys.readouterr().err == f"--name=run: {path} already holds a run; takes another name\n"
+    assert (
+        capsys.readouterr().err
+        == f"--name=run: {path} already holds a run; takes another name, or --overwrite replaces it\n"
+    )
     assert {item: item.stat().st_mtime_ns for item in path.rglob("*")} == before
 
 

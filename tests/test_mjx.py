@@ -88,6 +88,7 @@ def sliding():
     return model, jax.jit(physics.advance), jax.jit(physics.place)
 
 
+@pytest.mark.slow
 def test_models_own_solver_settings_are_reachable_and_give_the_same_step():
     env = envs.make("cheetah", iterations=None, ls_iterations=None)
     rows, (first, after) = recorded("cheetah"), ours("cheetah")
