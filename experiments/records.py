@@ -73,23 +73,28 @@ class RunExists(Exception):
     """The run directory already holds a run."""
 
 
+class NotARun(Exception):
+    """The directory holds something else than a run."""
+
+
 # What a run leaves: nothing else is ever removed.
 RUN_FILES = ("config.json", "evaluations.csv", "metrics.csv", "summary.json", "summary.json.part", "curves.png")
 RUN_FOLDERS = ("policy", "tensorboard")
 
 
 def remove_run(path: Path) -> None:
-    """Removes the files of the run in `path`, if there is one, and leaves all else alone.
+    """Removes the run in `path`, if there is one.
 
     Raises:
-      RunExists: there are other files too, or it is not a folder of its own but a link.
+      NotARun: what is there is not a run alone: there is no config.json, there are other files, or links.
       OSError: a file cannot be removed.
     """
     if not path.exists():
         return
     names = {item.name for item in path.iterdir()}
-    if path.is_symlink() or any((path / name).is_symlink() for name in names) or names - {*RUN_FILES, *RUN_FOLDERS}:
-        raise RunExists
+    links = path.is_symlink() or any(item.is_symlink() for item in path.rglob("*"))
+    if names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS} or links):
+        raise NotARun
     for name in names & {*RUN_FOLDERS}:
         shutil.rmtree(path / name)
     for name in names & {*RUN_FILES}:

@@ -102,6 +102,10 @@ def run(plan: Plan, command: Sequence[str]) -> int:
         if options.overwrite:
             records.remove_run(plan.path)
         files = records.Records(plan.path, members, plan.swept, options.tensorboard)
+    except records.NotARun:
+        raise flags.UsageError(
+            f"--overwrite: {plan.path} holds other things than a run; takes a folder with a run alone"
+        ) from None
     except records.RunExists:
         raise flags.UsageError(_taken(plan.path)) from None
     except OSError as error:

@@ -192,7 +192,7 @@ def check_agent(algo: str, agent: AgentConfig) -> None:
     _refuse(n > 1 and agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
     if agent.reduce == "subset_min":
         _refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
-    if agent.reduce != "subset_min":
+    else:
         differs = agent.subset_size != AgentConfig.subset_size
         _refuse(differs, "subset_size", f"has no effect with --reduce={agent.reduce}")
     if agent.learn_temperature:

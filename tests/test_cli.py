@@ -208,7 +208,9 @@ def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsy
     assert (path / "config.json").read_text() == "old"
     (path / "thesis.tex").write_text("mine")
     assert run(tmp_path, "--overwrite") == 2
-    assert capsys.readouterr().err.count("\n") == 1 and (path / "config.json").read_text() == "old"
+    line = capsys.readouterr().err
+    assert line.startswith(f"--overwrite: {path} holds other things than a run; takes ") and line.count("\n") == 1
+    assert (path / "config.json").read_text() == "old"
     (path / "thesis.tex").unlink()
     assert run(tmp_path, "--overwrite", "--penalty_coef=0,0.5") == 0
     assert json.loads((path / "config.json").read_text())["settings"]["algo"] == "sac_sqt"

@@ -220,7 +220,7 @@ def test_only_a_runs_own_files_are_removed(tmp_path):
     assert path.exists() and not any(path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["foreign file", "link", "linked folder"])
+@pytest.mark.parametrize("kind", ["foreign file", "link", "linked folder", "no run"])
 def test_what_is_not_only_a_run_is_left_alone(tmp_path, kind):
     path, other = tmp_path / "run", tmp_path / "other"
     other.mkdir()
@@ -229,11 +229,11 @@ def test_what_is_not_only_a_run_is_left_alone(tmp_path, kind):
         path.symlink_to(other)
     else:
         path.mkdir()
-        (path / "config.json").write_text("x")
+        (path / "config.json" if kind != "no run" else path / "curves.png").write_text("x")
         if kind == "foreign file":
             (path / "thesis.tex").write_text("x")
-        else:
+        elif kind == "linked folder":
             (path / "policy").symlink_to(other)
-    with pytest.raises(records.RunExists):
+    with pytest.raises(records.NotARun):
         records.remove_run(path)
-    assert (other / "thesis.tex").exists() and (kind == "link" or (path / "config.json").exists())
+    assert (other / "thesis.tex").exists() and (kind == "link" or any(path.iterdir()))

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from sqt_jax.envs.physics import QUANTITIES
 from sqt_jax.types import Array
 
 INF = float("inf")
@@ -67,8 +68,6 @@ def _humanoid_healthy(qpos: Array, qvel: Array) -> Array:
     return (qpos[2] > 1.0) & (qpos[2] < 2.0)
 
 
-BODY_QUANTITIES = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
-
 V4 = {
     "cheetah": Task(
         "HalfCheetah-v4", "half_cheetah.xml", 5, ctrl_cost=0.1, noise=0.1, normal_velocity=True,
@@ -83,7 +82,7 @@ V4 = {
     ),
     "humanoid": Task(
         "Humanoid-v4", "humanoid.xml", 5, ctrl_cost=0.1, noise=1e-2,
-        tracked=_center_of_mass, hidden=2, quantities=BODY_QUANTITIES,
+        tracked=_center_of_mass, hidden=2, quantities=QUANTITIES,
         forward=1.25, alive=5.0, healthy=_humanoid_healthy,
     ),
     "hopper": Task(
@@ -96,7 +95,7 @@ V4 = {
     # The height is divided by the simulator's time step of 0.003 s.
     "humanoid_standup": Task(
         "HumanoidStandup-v4", "humanoidstandup.xml", 5, ctrl_cost=0.1, noise=1e-2,
-        hidden=2, quantities=BODY_QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
+        hidden=2, quantities=QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
         contact_cost=5e-7, max_contact_cost=10.0,
     ),
 }  # fmt: skip

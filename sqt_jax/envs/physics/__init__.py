@@ -44,7 +44,7 @@ class Physics(NamedTuple):
     advance: Callable[[PhysicsState, Array], PhysicsState]  # (state, control [nu]) -> state one control step later
 
 
-# fields of mjData that a task may ask for
+# fields of mjData that a task may ask for, in the order in which the humanoids observe them
 QUANTITIES = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 # name -> module with `make(setup, **options) -> Physics`, imported when first asked for

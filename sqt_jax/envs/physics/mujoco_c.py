@@ -45,6 +45,7 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
         raise ValueError(f"{model.na} activation states: only models with none")
     if num_threads is not None and num_threads < 1:
         raise ValueError(f"num_threads takes at least 1, not {num_threads}")
+    placed_quantities = _placed_quantities(setup)
     stepper = Stepper(setup, num_threads or usable_cores())
     num_places = model.nq + model.nv
     # a header (0: just placed, the words are float32; 1: stepped, they are float64), x of the tracked point, STATE
@@ -54,7 +55,7 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         words = _bits(jnp.concatenate([qpos, qvel]))
         internal = jnp.zeros(state_words, jnp.uint32).at[1 : 1 + num_places].set(words)
-        quantities = _placed_quantities(setup, qpos, qvel)
+        quantities = placed_quantities(qpos, qvel)
         return PhysicsState(qpos, qvel, jnp.zeros((), jnp.float32), quantities, internal)
 
     def host(packed: np.ndarray) -> np.ndarray:
@@ -235,11 +236,15 @@ def _bits(x: Array) -> Array:
     return jax.lax.bitcast_convert_type(x, jnp.uint32)
 
 
-def _placed_quantities(setup: Setup, qpos: Array, qvel: Array) -> dict[str, Array]:
-    """The quantities of a robot that was just placed. By MJX: a call to the host for every possible start would cost
-    more than the few kinematics of it, which are exact to float32."""
+def _placed_quantities(setup: Setup) -> Callable[[Array, Array], dict[str, Array]]:
+    """(qpos, qvel) -> the quantities of a robot that was just placed there.
+
+    By MJX: a call to the host for every possible start would cost more than the few kinematics of it, which are exact
+    to float32.
+    """
     if not setup.quantities:
-        return {}
+        return lambda qpos, qvel: {}
     from sqt_jax.envs.physics import mjx
 
-    return mjx.make(setup).place(qpos, qvel).quantities
+    place = mjx.make(setup).place
+    return lambda qpos, qvel: place(qpos, qvel).quantities
