@@ -25,6 +25,10 @@ EXAMPLE = "python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4"
 DEFAULT_SEEDS = (0, 1, 2, 3, 4)
 MAX_SEED = 2**32 - 1
 MAX_CONFIG_BYTES = 100_000
+# The run's own flags that a resumed run takes over; the smallest value of each.
+OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "tensorboard": False}
+CHECKPOINT_EVERY = 25_000
+KEEP_CHECKPOINTS = 2
 
 # What each setting is, for --help: a new field of the configuration becomes a flag by itself and wants a line here.
 SETTING_HELP = {
@@ -82,18 +86,21 @@ DEFAULT_TEXT = {
 
 
 class Options(NamedTuple):
-    """A parsed command line. Only what was given is in `settings` and `sweep`."""
+    """A parsed command line. Only what was given is in `settings` and `sweep`; None is what was not."""
 
-    algo: str
-    env: str
-    seeds: tuple[int, ...]
+    algo: str | None  # not required with the folder of a run to resume; neither is env
+    env: str | None
+    seeds: tuple[int, ...] | None
     settings: dict[str, Any]  # one value for all members
     sweep: dict[str, tuple[float, ...]]  # scalars with several values, in the order of `Scalars`
     preset: str
     out: str
     name: str | None
+    resume: str | None  # the folder of a run; "": the one that these settings belong to
     overwrite: bool
-    tensorboard: bool
+    checkpoint_every: int | None
+    keep_checkpoints: int | None
+    tensorboard: bool | None
     quiet: bool
 
 
@@ -199,7 +206,23 @@ FLAGS: dict[str, list[_Flag]] = {
     "Output": [
         _Flag("out", str, "a folder", "results go to OUT/ENV/ALGO/NAME/", "runs"),
         _Flag("name", str, "a word", "name of the run", "settings that differ from the defaults, and the time"),
+        _Flag(
+            "resume",
+            str,
+            "the folder of a run, or nothing: the latest run of the same settings, or the one called --name",
+            "go on with a run where its last checkpoint is; --steps may be raised",
+            "off",
+        ),
         _Flag("overwrite", None, "true or false", "replace a run of the same name", "false"),
+        _Flag(
+            "checkpoint_every",
+            _integer,
+            "a whole number",
+            "environment steps between checkpoints, which are also made at the end and where the run is interrupted; "
+            "0: none at all",
+            str(CHECKPOINT_EVERY),
+        ),
+        _Flag("keep_checkpoints", _integer, "a whole number", "how many are kept", str(KEEP_CHECKPOINTS)),
         _Flag("tensorboard", None, "true or false", "also write TensorBoard events", "true"),
         _Flag("quiet", None, "true or false", "print errors only", "false"),
         _Flag("help", None, "true or false", "this text", ""),
@@ -232,7 +255,7 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
         else:
             absl_flags.DEFINE(_Parser(flag), flag.name, None, flag.help, flag_values=values)
     try:
-        rest = values(list(argv), known_only=False)[1:]
+        rest = values(_with_resume_valued(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
         hint = nearest(f"--{error.flagname}", [f"--{flag.name}" for flag in known]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
@@ -247,6 +270,15 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     if rest:
         raise UsageError(f"{rest[0]}: unexpected argument; settings are given as --flag=value")
     return {flag.name: values[flag.name].value for flag in known if values[flag.name].present}
+
+
+def _with_resume_valued(argv: Sequence[str]) -> list[str]:
+    """`--resume` alone, at the end or before another flag, as `--resume=`."""
+    following = [*argv[1:], "-"]
+    return [
+        f"{word}=" if word.lstrip("-") == "resume" and word != "resume" and after.startswith("-") else word
+        for word, after in zip(argv, following, strict=True)
+    ]
 
 
 def _file_values(name: str) -> dict[str, Any]:
@@ -270,7 +302,7 @@ def _file_values(name: str) -> dict[str, Any]:
         refuse("takes lines like `steps: 100000`")
     arguments = []
     for key, value in content.items():
-        if key in ("config", "help"):
+        if key in ("config", "help", "resume"):
             refuse(f"{key} is for the command line")
         items = value if isinstance(value, list) else [value]
         if not items or not all(isinstance(item, bool | int | float | str) for item in items):
@@ -295,9 +327,19 @@ def parse(argv: Sequence[str]) -> Options | None:
     if "config" in values:
         values = _file_values(values.pop("config")) | values
     own = {name: values.pop(name, None) for name in ("algo", "env", "seeds", "preset", "out", "name")}
+    output = {name: values.pop(name, None) for name in OUTPUT}
+    resume, overwrite = values.pop("resume", None), values.pop("overwrite", False)
     for required in ("algo", "env"):
-        if not own[required]:
+        if not own[required] and not resume:
             raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
+    if resume is not None and overwrite:
+        raise UsageError("--overwrite: takes no --resume beside it: the one replaces a run, the other goes on with it")
+    for name in ("out", "name", "preset"):
+        if resume and own[name] is not None:
+            raise UsageError(f"--{name}: has no effect with --resume={resume}")
+    for name, lowest in OUTPUT.items():
+        if output[name] is not None and output[name] < lowest:
+            raise UsageError(f"--{name}: takes a whole number of at least {lowest}, not {output[name]}")
 
     preset = own["preset"] or "paper"
     if preset not in PRESETS:
@@ -315,8 +357,7 @@ def parse(argv: Sequence[str]) -> Options | None:
 
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
-    tensorboard, quiet = values.pop("tensorboard", True), values.pop("quiet", False)
-    overwrite = values.pop("overwrite", False)
+    quiet = values.pop("quiet", False)
     if values.get("temperature") == "auto":
         del values["temperature"]
         settings["learn_temperature"] = True
@@ -336,15 +377,16 @@ def parse(argv: Sequence[str]) -> Options | None:
     return Options(
         algo=own["algo"],
         env=own["env"],
-        seeds=_check_seeds(own["seeds"] if own["seeds"] is not None else DEFAULT_SEEDS),
+        seeds=_check_seeds(own["seeds"]) if own["seeds"] is not None else None if resume else DEFAULT_SEEDS,
         settings=settings,
         sweep=sweep,
         preset=preset,
         out=own["out"] or "runs",
         name=name,
+        resume=resume,
         overwrite=overwrite,
-        tensorboard=tensorboard,
         quiet=quiet,
+        **output,
     )
 
 
@@ -369,6 +411,7 @@ def help_text() -> str:
         "",
         f"  {EXAMPLE}",
         "  python -m experiments.run --algo=td3_sqt --env=cheetah --seeds=0,1 --penalty_coef=0.1,0.5 --preset=quick",
+        "  python -m experiments.run --resume=runs/ant/sac_sqt/20250102T030405Z",
     ]
     for group, rows in FLAGS.items():
         lines += ["", f"{group}:"]

@@ -1,16 +1,14 @@
-"""The host loop: chunks of compiled training between evaluations, and what they report.
+"""The host loop: chunks of compiled training between evaluations and checkpoints, and what they report.
 
-Everything the loop needs is a value: the compiled sweep, a display, a function that takes reports, one that says
-whether to stop. It writes no files.
+Everything the loop needs is a value: the compiled sweep, a display, a function that takes reports, one that takes
+checkpoints, one that says whether to stop. It writes no files.
 """
 
 import time
 from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.progress import Display, Status, eta_seconds
@@ -26,19 +24,31 @@ class Report(NamedTuple):
 
     env_steps: int
     gradient_steps: int
-    wall_seconds: float  # since the loop began
+    wall_seconds: float  # of training and evaluating, those of an earlier process that this one continues included
     metrics: dict[str, np.ndarray]  # name -> [S], of the steps since the last report; empty at step 0
     returns: np.ndarray | None  # [S, episodes]; None where there was no evaluation
     lengths: np.ndarray | None  # [S, episodes]
+
+
+class Position(NamedTuple):
+    """Where a run stands: with the training state, all that the loop needs to go on from there."""
+
+    env_steps: int = 0
+    evaluated: int = -1  # environment steps of the last evaluation
+    diverged: tuple[tuple[int, int], ...] = ()  # (member, environment steps) of those that are known to have
+    wall_seconds: float = 0.0
+
+
+BEGINNING = Position()
 
 
 class Outcome(NamedTuple):
     state: TrainState
     env_steps: int
     interrupted: bool
-    diverged: dict[int, int]  # member -> environment steps at which it was found
+    diverged: dict[int, int]  # member -> environment steps
     wall_seconds: float
-    train_seconds: float  # without compilation
+    train_seconds: float  # of this process, without compilation
     steps_per_second: float | None  # of all members together, without compilation; None before the second chunk
 
 
@@ -76,24 +86,19 @@ class Pace:
             self.evaluate_seconds += seconds
         self.evaluations += 1
 
-    def eta(self, done: int, train: TrainConfig) -> float | None:
+    def eta(self, done: int, evaluated: int, train: TrainConfig) -> float | None:
         warmup_left = max(0, min(train.warmup_steps, train.steps) - done)
         return eta_seconds(
             steps_left={False: warmup_left, True: train.steps - done - warmup_left},
             steps_per_second={learn: rate * train.num_envs for learn, rate in self.rates.items()},
-            evaluations_left=len(evaluation_steps(train)) - self.evaluations,
+            evaluations_left=sum(step > evaluated for step in evaluation_steps(train)),
             seconds_per_evaluation=self.evaluate_seconds / (self.evaluations - 1) if self.evaluations > 1 else None,
         )
 
 
-@partial(jax.jit, static_argnums=1)
-def _finite(tree: Any, num_members: int) -> jax.Array:
-    """[S] bool: whether all of a member's own floating-point numbers are finite."""
-    ok = jnp.ones(num_members, bool)
-    for leaf in jax.tree.leaves(tree):
-        if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.ndim:
-            ok &= jnp.all(jnp.isfinite(leaf.reshape(num_members, -1)), axis=1)
-    return ok
+def checkpoint_steps(every: int, start: int, end: int) -> list[int]:
+    """Environment steps after `start` at which a checkpoint is due: multiples of `every`, and the end."""
+    return [*range((start // every + 1) * every, end, every), end] if every and start < end else []
 
 
 def train_loop(
@@ -105,80 +110,92 @@ def train_loop(
     report: Callable[[Report], None],
     display: Display,
     stop: Callable[[], bool],
+    start: Position = BEGINNING,
+    checkpoint_every: int = 0,
+    save: Callable[[TrainState, Position], None] = lambda state, position: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Outcome:
-    """Train a fresh `state` to `train.steps`, with an evaluation at step 0, every `eval_every` and at the end.
+    """Train `state`, which stands at `start`, to `train.steps`: evaluations at step 0, every `eval_every` and the end.
 
-    Advances in chunks that end at the evaluations and at the end of the warm-up. `stop` is asked between chunks;
-    once it says True, what there is is reported and the loop returns.
+    Advances in chunks that end at evaluations, checkpoints and the end of the warm-up. `save` is called every
+    `checkpoint_every` environment steps and at the end (0: never), after an evaluation's report. `stop` is asked
+    between chunks; once it says True, the state is saved, what there is is reported and the loop returns.
     """
-    began = clock()
+    began = clock() - start.wall_seconds
     pace = Pace()
-    diverged: dict[int, int] = {}
-    done = 0
-    last_point = 0  # where the interval began
+    diverged = dict(start.diverged)
+    done, evaluated, reported = start.env_steps, start.evaluated, max(start.evaluated, 0)
     interrupted = False
     last_return: float | None = None
 
     def show(phase: str, learn: bool) -> None:
         rate = pace.rates[learn] * train.num_envs * num_members if learn in pace.rates else None
-        display.update(Status(phase, done, rate, pace.eta(done, train), last_return))
+        display.update(Status(phase, done, rate, pace.eta(done, evaluated, train), last_return))
 
-    def evaluate_and_report(metrics: dict[str, np.ndarray]) -> None:
-        nonlocal last_return
+    def evaluate_and_report() -> None:
+        nonlocal last_return, evaluated
         show("evaluating" if pace.evaluations else "compiling the evaluation", done >= train.warmup_steps)
-        start = clock()
+        before = clock()
         evaluation = sweep.evaluate(state)
         returns, lengths = np.asarray(evaluation.returns), np.asarray(evaluation.lengths)
-        pace.evaluated(clock() - start)
-        bad = find_diverged(metrics, returns)
-        # An environment takes a NaN action as the end of the episode: what a diverged member returns says nothing.
+        pace.evaluated(clock() - before)
+        bad = find_diverged(returns)
+        # The return of the policy that a diverged member is frozen at is not what its algorithm reaches at this step.
         returns = np.where(bad[:, None], np.nan, returns)
         if not bad.all():
             last_return = float(np.nanmean(returns))
-        send(metrics, returns, lengths)
+        send(returns, lengths)
+        evaluated = done
         display.evaluated(done, returns[~bad].mean(axis=1))
 
-    def find_diverged(metrics: dict[str, np.ndarray], returns: np.ndarray | None) -> np.ndarray:
+    def find_diverged(returns: np.ndarray | None) -> np.ndarray:
         """[S] bool; members that were not known to be are announced."""
-        # NaN metrics are those not measured; a NaN loss is seen in the parameters it made.
-        bad = ~np.asarray(_finite(state.agent, num_members))
-        bad |= np.any([np.isinf(values) for values in metrics.values()], axis=0)
-        if returns is not None:
-            bad |= ~np.isfinite(returns).all(axis=1)
-        for member in (int(index) for index in np.flatnonzero(bad)):
+        since = np.asarray(state.diverged_at)
+        if returns is not None:  # an environment whose rewards are not finite
+            since = np.where((since < 0) & ~np.isfinite(returns).all(axis=1), done, since)
+        for member in (int(index) for index in np.flatnonzero(since >= 0)):
             if member not in diverged:
-                diverged[member] = done
-                display.message(f"member {member} diverged: not all its numbers are finite at step {done:,}")
-        return bad
+                diverged[member] = int(since[member])
+                step = f"step {diverged[member]:,}"
+                display.message(f"member {member} diverged at {step}: it stays as it was before, the others go on")
+        return np.isin(np.arange(num_members), list(diverged))
 
-    def send(metrics: dict[str, np.ndarray], returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
+    def send(returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
+        """What the state tells of the interval; nothing before the first step."""
+        metrics = {name: np.asarray(value) for name, value in sweep.measure(state).items()} if done else {}
         report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths))
 
-    def measured() -> dict[str, np.ndarray]:
-        """What the state tells of the interval; nothing before the first step."""
-        return {name: np.asarray(value) for name, value in sweep.measure(state).items()} if done else {}
+    def save_here() -> None:
+        if checkpoint_every:
+            show("saving", done >= train.warmup_steps)
+            save(state, Position(done, evaluated, tuple(diverged.items()), clock() - began))
 
-    for point in evaluation_steps(train):
-        state = new_interval(state)
+    evaluations = {step for step in evaluation_steps(train) if step > evaluated}
+    checkpoints = set(checkpoint_steps(checkpoint_every, done, train.steps))
+    for point in sorted(evaluations | checkpoints):
         while done < point and not stop():
             learn = done >= train.warmup_steps
             end = point if learn else min(point, train.warmup_steps)
             steps = pace.chunk(learn, (end - done) // train.num_envs)
             show(("training" if learn else "warm-up") if pace.compiled else "compiling the training", learn)
-            start = clock()
+            before = clock()
             state = sweep.advance(state, steps, learn)
             jax.block_until_ready(state.env_steps)
-            pace.advanced(learn, steps, clock() - start)
+            pace.advanced(learn, steps, clock() - before)
             done += steps * train.num_envs
+            find_diverged(None)
         if stop():
             interrupted = True
-            if done > last_point:
-                find_diverged(measured(), None)
-                send(measured(), None, None)
+            save_here()
+            if done > reported:
+                send(None, None)
             break
-        evaluate_and_report(measured())
-        last_point = point
+        if point in evaluations:
+            evaluate_and_report()
+            reported = done
+            state = new_interval(state)
+        if point in checkpoints:
+            save_here()
 
     timed = pace.steps * train.num_envs * num_members
     rate = timed / pace.train_seconds if pace.train_seconds else None

@@ -1,26 +1,21 @@
-"""What a run leaves in `<out>/<env>/<algo>/<name>/`: settings, tables, a summary, events for TensorBoard."""
+"""What a run leaves in `<out>/<env>/<algo>/<name>/`: tables, a summary, events for TensorBoard."""
 
 import csv
 import json
 import math
 import os
 import shutil
-import subprocess
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from scipy import stats
 from tensorboardX import SummaryWriter
 
+from experiments import files
+from experiments.described import Member
 from experiments.loop import Outcome, Report
-from sqt_jax.algorithms import eval_physics_of
-from sqt_jax.config import Config
 
 # The columns that every evaluations.csv has; further swept scalars follow.
 EVALUATION_COLUMNS = (
@@ -37,19 +32,6 @@ EVALUATION_COLUMNS = (
     "value_bias",
     "wall_seconds",
 )
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "brax", "gymnasium", "numpy", "sqt_jax")
-
-
-class Member(NamedTuple):
-    """One member of a run: a seed with one setting of the swept scalars."""
-
-    seed: int
-    config: Config
-
-
-def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member]:
-    """Seeds times configurations; seeds vary fastest."""
-    return [Member(seed, config) for config, seed in product(configs, seeds)]
 
 
 class Score(NamedTuple):
@@ -73,17 +55,36 @@ class RunExists(Exception):
     """The run directory already holds a run."""
 
 
+class Shortened(Exception):
+    """A table holds less than a checkpoint says; its name."""
+
+
 class NotARun(Exception):
     """The directory holds something else than a run."""
 
 
 # What a run leaves: nothing else is ever removed.
-RUN_FILES = ("config.json", "evaluations.csv", "metrics.csv", "summary.json", "summary.json.part", "curves.png")
-RUN_FOLDERS = ("policy", "tensorboard")
+RUN_FILES = (
+    "config.json",
+    "config.json.part",
+    "evaluations.csv",
+    "metrics.csv",
+    "summary.json",
+    "summary.json.part",
+    "curves.png",
+)
+RUN_FOLDERS = ("checkpoint", "policy", "tensorboard")
+# What a run that died before it began may have left.
+LEFTOVERS = {"lock", "config.json.part"}
+
+
+def is_taken(path: Path) -> bool:
+    """Whether there is anything in `path` that a new run would mix with."""
+    return path.is_dir() and any(item.name not in LEFTOVERS for item in path.iterdir())
 
 
 def remove_run(path: Path) -> None:
-    """Removes the run in `path`, if there is one.
+    """Removes the run in `path`, if there is one, but for its lock.
 
     Raises:
       NotARun: what is there is not a run alone: there is no config.json, there are other files, or links.
@@ -91,7 +92,7 @@ def remove_run(path: Path) -> None:
     """
     if not path.exists():
         return
-    names = {item.name for item in path.iterdir()}
+    names = {item.name for item in path.iterdir()} - {"lock"}
     links = path.is_symlink() or any(item.is_symlink() for item in path.rglob("*"))
     if names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS} or links):
         raise NotARun
@@ -102,27 +103,48 @@ def remove_run(path: Path) -> None:
 
 
 class Records:
-    """Writes the files of one run as it goes; a context manager.
+    """Writes the tables and events of one run as it goes; a context manager.
+
+    Args:
+      path: the run's folder, which is this process's own (`files.locked`).
+      resumed_at: where a run is gone on with, the env steps and what `lengths` gave there: what was written later is
+        cut off, for training writes it again.
 
     Raises:
-      RunExists: the directory is not empty. Of two runs that start at once with one name, one gets it.
-      OSError: the directory cannot be made or written.
+      RunExists: there is something in the folder already, and no run is resumed.
+      Shortened: the tables of a run that is resumed have lost rows.
+      OSError: the folder cannot be made or written.
     """
 
-    def __init__(self, path: Path, members: Sequence[Member], swept: Sequence[str], tensorboard: bool = True):
+    def __init__(
+        self,
+        path: Path,
+        members: Sequence[Member],
+        swept: Sequence[str],
+        tensorboard: bool = True,
+        resumed_at: tuple[int, Mapping[str, int]] | None = None,
+    ):
         path.mkdir(parents=True, exist_ok=True)
-        if any(path.iterdir()):
+        if resumed_at is None and is_taken(path):
             raise RunExists
-        try:
-            self._config = (path / "config.json").open("x")
-        except FileExistsError:
-            raise RunExists from None
+        env_steps, lengths = resumed_at or (None, {})
         self.path, self.members = path, members
         self.swept = [name for name in swept if name != "penalty_coef"]
-        self._evaluations = _Table(path / "evaluations.csv", [*EVALUATION_COLUMNS, *self.swept])
-        self._metrics: _Table | None = None  # its columns are known with the first metrics
+        self._evaluations = _Table(
+            path / "evaluations.csv", lengths.get("evaluations", 0), [*EVALUATION_COLUMNS, *self.swept]
+        )
+        # Its columns are known with the first metrics.
+        self._metrics: _Table | None = None
+        if lengths.get("metrics", 0):
+            self._metrics = _Table(path / "metrics.csv", lengths["metrics"])
+        else:
+            (path / "metrics.csv").unlink(missing_ok=True)
+        purge_step = None if env_steps is None else env_steps + 1  # events from there on do not count
         self._events = (
-            [SummaryWriter(str(path / "tensorboard" / _label(member, self.swept))) for member in members]
+            [
+                SummaryWriter(str(path / "tensorboard" / _label(member, self.swept)), purge_step=purge_step)
+                for member in members
+            ]
             if tensorboard
             else []
         )
@@ -131,23 +153,22 @@ class Records:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._config.close()
         self._evaluations.close()
         if self._metrics:
             self._metrics.close()
         for writer in self._events:
             writer.close()
 
-    def config(self, values: Mapping[str, Any]) -> None:
-        with self._config as file:
-            _write_json(file, values)
+    def lengths(self) -> dict[str, int]:
+        """Bytes of the tables, which are on disk by then."""
+        return {"evaluations": self._evaluations.length(), "metrics": self._metrics.length() if self._metrics else 0}
 
     def report(self, report: Report) -> None:
         """A row per member in evaluations.csv where there was an evaluation, in metrics.csv where there were steps."""
         if report.metrics and self._metrics is None:
             columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *report.metrics]
             # SAC's temperature is a metric too, and says the same where it is swept.
-            self._metrics = _Table(self.path / "metrics.csv", [*dict.fromkeys(columns), "wall_seconds"])
+            self._metrics = _Table(self.path / "metrics.csv", 0, [*dict.fromkeys(columns), "wall_seconds"])
         for index, member in enumerate(self.members):
             metrics = {name: float(values[index]) for name, values in report.metrics.items()}
             row: dict[str, Any] = {
@@ -190,21 +211,39 @@ class Records:
             "steps_per_second": outcome.steps_per_second,
             "diverged": [{"member": member, "env_steps": steps} for member, steps in outcome.diverged.items()],
         } | summarise(table)
-        temporary = self.path / "summary.json.part"
-        with temporary.open("w") as file:
-            _write_json(file, summary)
-        temporary.rename(self.path / "summary.json")
+        with files.whole_file(self.path / "summary.json") as file:
+            file.write((json.dumps(_without_nan(summary), indent=2, allow_nan=False) + "\n").encode())
         return summary
 
 
 class _Table:
-    """A CSV file whose rows are on disk as soon as they are written."""
+    """A CSV file that outlives the process row by row.
 
-    def __init__(self, path: Path, columns: Sequence[str]):
-        self._file = path.open("x", newline="")
+    Of a file that exists, the first `keep` bytes stay; its columns are then its own.
+
+    Raises:
+      Shortened: it has fewer.
+    """
+
+    def __init__(self, path: Path, keep: int, columns: Sequence[str] = ()):
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        self._file = os.fdopen(descriptor, "r+", newline="")
+        if os.fstat(descriptor).st_size < keep:
+            self._file.close()
+            raise Shortened(path.name)
+        if keep:
+            columns = next(csv.reader([self._file.readline()]))
+        os.ftruncate(descriptor, keep)
+        self._file.seek(keep)
         self._writer = csv.DictWriter(self._file, columns, restval="", lineterminator="\n")
-        self._writer.writeheader()
+        if not keep:
+            self._writer.writeheader()
         self._file.flush()
+
+    def length(self) -> int:
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return os.fstat(self._file.fileno()).st_size
 
     def write(self, row: Mapping[str, Any]) -> None:
         self._writer.writerow({name: "" if value != value else value for name, value in row.items()})
@@ -286,67 +325,9 @@ def summarise(table: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {"groups": grouped, "members": members}
 
 
-def describe(members: Sequence[Member], swept: Sequence[str], command: Sequence[str], preset: str) -> dict[str, Any]:
-    """What config.json holds: the settings (of the first member), the members, and what they ran on."""
-    device = jax.local_devices()[0]
-    return {
-        "settings": members[0].config.flat(),
-        "preset": preset,
-        "evaluated_on": eval_physics_of(members[0].config),
-        "members": [
-            {"member": index, "seed": member.seed}
-            | {name: getattr(member.config.agent, name) for name in dict.fromkeys(["penalty_coef", *swept])}
-            for index, member in enumerate(members)
-        ],
-        "command": list(command),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "device": {"platform": device.platform, "kind": device.device_kind, "cpus": os.cpu_count()},
-        "commit": _commit(),
-        "versions": {name: _version(name) for name in PACKAGES},
-    }
-
-
-def default_name(changed: Mapping[str, Any], now: datetime) -> str:
-    """A run's name from the settings that differ from the defaults, and the time (UTC)."""
-
-    def text(value: Any) -> str:
-        return "+".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-    words = [f"{name}={text(value)}" for name, value in changed.items()]
-    # File names end at 255 bytes; which settings they were is in config.json.
-    label = "_".join(words)[:180].replace("/", "-")
-    return "_".join(filter(None, [label, now.strftime("%Y%m%dT%H%M%SZ")]))
-
-
 def _label(member: Member, swept: Sequence[str]) -> str:
     words = [f"{name}={getattr(member.config.agent, name):g}" for name in ("penalty_coef", *swept)]
     return ",".join([f"seed={member.seed}", *words])
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _commit() -> str | None:
-    """The commit of the checkout this file belongs to, with `+changes` where files differ; None without one."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # not some other repository around an installation
-        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
-def _write_json(file: Any, values: Mapping[str, Any]) -> None:
-    json.dump(_without_nan(values), file, indent=2, allow_nan=False)
-    file.write("\n")
 
 
 def _without_nan(value: Any) -> Any:

@@ -4,149 +4,194 @@ Exit codes: 0 done; 2 bad usage (one line, nothing written); 3 a member diverged
 """
 
 import os
-import re
+import shlex
+import shutil
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from datetime import UTC, datetime
-from itertools import product
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-import psutil
 from rich.console import Console
 
 from experiments import flags, progress, runtime
-from experiments.loop import train_loop
-from experiments.presets import preset_settings
-from sqt_jax import envs
-from sqt_jax.algorithms import make_config, make_trainer, memory_estimate
-from sqt_jax.config import ConfigError
+from experiments.loop import BEGINNING, Outcome, Position, train_loop
+from sqt_jax.algorithms import make_trainer, replay_of
 from sqt_jax.policy import save_policy
-from sqt_jax.train import evaluation_steps, make_sweep
-from sqt_jax.types import Environment, Scalars
+from sqt_jax.train import Sweep, TrainState, evaluation_steps, make_sweep
+from sqt_jax.types import Array, Environment, Scalars
 
-# `records` and `plots` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are imported
-# where they are used, so that a typing error is answered in a second.
+# `plan`, `records` and `plots` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are
+# imported where they are used, so that a typing error is answered in a second.
 if TYPE_CHECKING:
-    from experiments.records import Member
+    from experiments.checkpoints import Checkpoints, Restored
+    from experiments.plan import Plan
+    from experiments.records import Records
 
 DONE, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 2, 3, 130
 
 
-class Plan(NamedTuple):
-    """A checked command line: everything a run needs, before anything is written or compiled."""
-
-    members: list["Member"]
-    swept: list[str]
-    path: Path
-    env: Environment
-    own_env: Environment | None  # which takes the place of the named one
-    options: flags.Options
-
-
-def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
-    """What a command line asks for; `env` takes the place of the environment that it names.
-
-    Raises `flags.UsageError` for settings that cannot be, a directory that is taken and too little memory.
-    """
-    from experiments.records import make_members
-
-    preset: dict[str, Any] = {}
-    try:
-        default = make_config(options.algo, options.env)
-        preset = preset_settings(options.preset, default.algo, default.env)
-        settings = preset | options.settings
-        configs = [
-            make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
-            for values in product(*options.sweep.values())
-        ]
-    except ConfigError as error:
-        by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
-        raise flags.UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
-    members = make_members(options.seeds, configs)
-    path = Path(options.out) / default.env / default.algo / (options.name or _default_name(options))
-    try:
-        if path.is_dir() and any(path.iterdir()) and not options.overwrite:
-            raise flags.UsageError(_taken(path))
-    except OSError as error:
-        raise flags.UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
-
-    own_env = env
-    try:
-        env = own_env or envs.make(default.env, configs[0].physics)
-    except ValueError as error:
-        raise flags.UsageError(f"--physics: {error}") from None
-    needed, free = memory_estimate(configs[0], len(members), env), _free_memory()
-    if needed > free:
-        raise flags.UsageError(
-            f"--replay_capacity={configs[0].train.replay_capacity}: {len(members)} members need about "
-            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; takes a smaller number, or fewer --seeds"
-        )
-    return Plan(members, list(options.sweep), path, env, own_env, options)
-
-
-def run(plan: Plan, command: Sequence[str]) -> int:
+def run(plan: "Plan", command: Sequence[str]) -> int:
     """Trains and records; the exit code."""
-    from experiments import plots, records
+    from experiments import checkpoints
 
-    options, members, env = plan.options, plan.members, plan.env
-    config = members[0].config
-    train = config.train
     console = Console()
+    with ExitStack() as stack:
+        _lock(plan, stack)
+        display = stack.enter_context(progress.Display(console, plan.train.steps, quiet=plan.options.quiet))
+        stop = stack.enter_context(_stop_on_signal())
+        sweep = make_sweep(make_trainer(plan.config, plan.own_env))
+        template = jax.eval_shape(sweep.init, *_start(plan))
+        folder, replay = plan.path / "checkpoint", replay_of(plan.config, plan.env)
+        store = checkpoints.Checkpoints(folder, replay, plan.output["keep_checkpoints"], display.message)
+        restored = store.restore(template) if plan.resumed else None
+        tables = stack.enter_context(_tables(plan, restored))
+        _describe(plan, restored, command)
+        if not plan.options.quiet:
+            _announce(console, plan, restored, store.sizes(template))
+        outcome = _train(plan, sweep, restored, tables, store, display, lambda: bool(stop))
+        summary = tables.summary(outcome)
+        curves = _results(plan, outcome)
+
+    if not plan.options.quiet:
+        console.print(progress.final_table(summary, tables.swept))
+        rate = "" if outcome.steps_per_second is None else f", {outcome.steps_per_second:,.0f} training steps/s"
+        console.print(
+            f"{summary['status']} after {progress.format_seconds(outcome.wall_seconds)}{rate}", highlight=False
+        )
+        if curves:
+            console.print(f"curves: {plan.path / 'curves.png'}", soft_wrap=True, highlight=False, markup=False)
+        if outcome.interrupted and plan.output["checkpoint_every"]:
+            command_line = f"python -m experiments.run --resume={shlex.quote(str(plan.path))}"
+            console.print(f"to go on with it: {command_line}", soft_wrap=True, highlight=False, markup=False)
+    return INTERRUPTED if outcome.interrupted else DIVERGED if outcome.diverged else DONE
+
+
+def _lock(plan: "Plan", stack: ExitStack) -> None:
+    """Makes the run's folder this process's own, until the stack is left."""
+    from experiments import files
+
     try:
-        if options.overwrite:
+        stack.enter_context(files.locked(plan.path))
+    except files.Busy as busy:
+        flag = f"--resume={plan.path}" if plan.resumed else f"--name={plan.path.name}"
+        raise flags.UsageError(f"{flag}: process {busy.process} is at work on {plan.path}; takes another run") from None
+    except OSError as error:
+        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
+
+
+def _start(plan: "Plan") -> tuple[Array, Scalars]:
+    """The members' keys [S] and scalars [S]."""
+    seeds = jnp.array([member.seed for member in plan.members], jnp.uint32)
+    agents = [member.config.agent for member in plan.members]
+    scalars = (jnp.array([getattr(agent, name) for agent in agents], jnp.float32) for name in Scalars._fields)
+    return jax.vmap(jax.random.key)(seeds), Scalars(*scalars)
+
+
+def _tables(plan: "Plan", restored: "Restored | None") -> "Records":
+    """The run's tables: new ones, or those of the resumed run as they were at its checkpoint."""
+    from experiments import records
+    from experiments.plan import taken
+
+    resumed_at = None
+    if plan.resumed:
+        resumed_at = (restored.position.env_steps, restored.lengths) if restored else (-1, {})
+    try:
+        if plan.options.overwrite:
             records.remove_run(plan.path)
-        files = records.Records(plan.path, members, plan.swept, options.tensorboard)
+        return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at)
     except records.NotARun:
         raise flags.UsageError(
             f"--overwrite: {plan.path} holds other things than a run; takes a folder with a run alone"
         ) from None
     except records.RunExists:
-        raise flags.UsageError(_taken(plan.path)) from None
+        raise flags.UsageError(taken(plan.path)) from None
+    except records.Shortened as error:
+        raise flags.UsageError(
+            f"--resume={plan.path}: {error} has lost rows since the checkpoint; takes a run with whole tables"
+        ) from None
     except OSError as error:
-        raise flags.UsageError(f"--out={options.out}: takes a folder that can be written: {error}") from None
+        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
 
-    with files, _stop_on_signal() as stop:
-        files.config(records.describe(members, plan.swept, command, options.preset))
-        if not options.quiet:
-            title = f"{config.algo} on {config.env}, members: {len(members)} -> {plan.path}"
-            console.print(title, soft_wrap=True, highlight=False, markup=False)
-            evaluations = len(evaluation_steps(train))
-            share = progress.evaluation_share(train.steps, evaluations, train.eval_episodes, env.episode_length)
-            console.print(share, soft_wrap=True, highlight=False)
-        sweep = make_sweep(make_trainer(config, plan.own_env))
-        seeds = jnp.array([member.seed for member in members], jnp.uint32)
-        scalars = Scalars(
-            *(
-                jnp.array([getattr(member.config.agent, name) for member in members], jnp.float32)
-                for name in Scalars._fields
-            )
-        )
-        with progress.Display(console, train.steps, quiet=options.quiet) as display:
-            state = sweep.init(jax.vmap(jax.random.key)(seeds), scalars)
-            outcome = train_loop(
-                sweep, state, train, len(members), report=files.report, display=display, stop=lambda: bool(stop)
-            )
-        summary = files.summary(outcome)
-        save_policy(plan.path / "policy", config, env, outcome.state.agent)
-        table = records.read_evaluations(plan.path / "evaluations.csv")
-        if len(table["member"]):
-            plots.draw_curves(table, plan.path / "curves.png", f"{config.algo} on {config.env}")
 
-    if not options.quiet:
-        console.print(progress.final_table(summary, files.swept))
-        rate = "" if outcome.steps_per_second is None else f", {outcome.steps_per_second:,.0f} training steps/s"
-        console.print(
-            f"{summary['status']} after {progress.format_seconds(outcome.wall_seconds)}{rate}", highlight=False
+def _describe(plan: "Plan", restored: "Restored | None", command: Sequence[str]) -> None:
+    """Writes config.json."""
+    from experiments import described
+
+    if plan.resumed:
+        at = restored.position.env_steps if restored else 0
+        content = described.resumed(plan.resumed.content, plan.train.steps, at, command)
+    else:
+        content = described.describe(plan.members, plan.swept, command, plan.options.preset, plan.output)
+    described.write(plan.path, content)
+
+
+def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes: tuple[int, int]) -> None:
+    """Says what is about to happen, and what it costs."""
+    from experiments import resume
+
+    def say(text: str) -> None:
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+    train = plan.train
+    say(f"{plan.config.algo} on {plan.config.env}, members: {len(plan.members)} -> {plan.path}")
+    if plan.resumed:
+        at = f"at step {restored.position.env_steps:,}" if restored else "from the start: it has no whole checkpoint"
+        say(f"going on with it {at}")
+        if others := resume.other_versions(plan.resumed):
+            say(f"other versions than when it began, so that it may go on differently: {', '.join(others)}")
+    evaluations = len(evaluation_steps(train))
+    say(progress.evaluation_share(train.steps, evaluations, train.eval_episodes, plan.env.episode_length))
+    if every := plan.output["checkpoint_every"]:
+        state, row = sizes
+        say(
+            f"a checkpoint every {every:,} steps, the last {plan.output['keep_checkpoints']} kept: "
+            f"{state / 1e6:,.1f} MB each, and the replay's rows once, {row * train.capacity / 1e6:,.1f} MB in the end"
         )
-        if len(table["member"]):
-            console.print(f"curves: {plan.path / 'curves.png'}", soft_wrap=True, highlight=False, markup=False)
-    return INTERRUPTED if outcome.interrupted else DIVERGED if outcome.diverged else DONE
+
+
+def _train(
+    plan: "Plan",
+    sweep: Sweep,
+    restored: "Restored | None",
+    tables: "Records",
+    store: "Checkpoints",
+    display: progress.Display,
+    stop: Callable[[], bool],
+) -> Outcome:
+    def save(state: TrainState, position: Position) -> None:
+        store.save(state, position, tables.lengths())
+
+    outcome = train_loop(
+        sweep,
+        restored.state if restored else sweep.init(*_start(plan)),
+        plan.train,
+        len(plan.members),
+        report=tables.report,
+        display=display,
+        stop=stop,
+        start=restored.position if restored else BEGINNING,
+        checkpoint_every=plan.output["checkpoint_every"],
+        save=save,
+    )
+    store.wait()
+    return outcome
+
+
+def _results(plan: "Plan", outcome: Outcome) -> bool:
+    """Writes the policies and, where there are evaluations, the curves; whether there are."""
+    from experiments import plots, records
+
+    shutil.rmtree(plan.path / "policy", ignore_errors=True)  # of the process that this one continues
+    save_policy(plan.path / "policy", plan.config, plan.env, outcome.state.agent)
+    table = records.read_evaluations(plan.path / "evaluations.csv")
+    if not len(table["member"]):
+        return False
+    plots.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+    return True
 
 
 def main(argv: Sequence[str], env: Environment | None = None) -> int:
@@ -157,6 +202,8 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
             print(flags.help_text())
             return DONE
         runtime.prepare()
+        from experiments.plan import make_plan
+
         return run(make_plan(options, env), argv)
     except flags.UsageError as error:
         line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error))
@@ -190,36 +237,6 @@ def _stop_on_signal() -> Iterator[list[int]]:
         yield received
     finally:
         restore()
-
-
-def _default_name(options: flags.Options) -> str:
-    from experiments.records import default_name
-
-    changed: dict[str, Any] = {} if options.preset == "paper" else {"preset": options.preset}
-    changed |= options.settings | options.sweep
-    if options.seeds != flags.DEFAULT_SEEDS:
-        changed["seeds"] = options.seeds
-    return default_name(changed, datetime.now(UTC))
-
-
-def _taken(path: Path) -> str:
-    return f"--name={path.name}: {path} already holds a run; takes another name, or --overwrite replaces it"
-
-
-def _free_memory() -> int:
-    """Bytes that a run may take: the accelerator's, or the machine's or its container's that are free."""
-    stats = jax.local_devices()[0].memory_stats()
-    if stats and "bytes_limit" in stats:
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-    free = psutil.virtual_memory().available
-    try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
-        cached = re.search(r"^inactive_file (\d+)$", Path("/sys/fs/cgroup/memory.stat").read_text(), re.MULTILINE)
-        reclaimable = int(cached[1]) if cached else 0
-        return free if limit == "max" else min(free, int(limit) - used + reclaimable)
-    except OSError:
-        return free
 
 
 if __name__ == "__main__":

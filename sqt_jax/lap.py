@@ -107,4 +107,10 @@ def lap(
         highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
         return LapState(state.rows, levels, highest)
 
-    return Replay(init, insert, sample, feedback)
+    def storage(state: LapState) -> Array:
+        return store.storage(state.rows)
+
+    def with_storage(state: LapState, rows: Array) -> LapState:
+        return state._replace(rows=store.with_storage(state.rows, rows))
+
+    return Replay(init, insert, sample, feedback, storage, with_storage)

@@ -1,8 +1,13 @@
-"""How parameters move: Adam with a traced learning rate, and the soft step of target networks."""
+"""How parameters move: Adam with a traced learning rate, and the soft step of target networks.
+
+Neither moves where the agent has diverged. The choice is made number by number, inside the step, and costs no copy.
+"""
 
 import jax
+import jax.numpy as jnp
 import optax
 
+from sqt_jax import trees
 from sqt_jax.types import Array, Params
 
 _adam = optax.scale_by_adam()
@@ -13,13 +18,19 @@ def adam_init(params: Params) -> optax.OptState:
 
 
 def adam_step(
-    params: Params, opt_state: optax.OptState, grads: Params, lr: Array | float
+    params: Params, opt_state: optax.OptState, grads: Params, lr: Array | float, diverged: Array
 ) -> tuple[Params, optax.OptState]:
-    """One step of Adam. `lr` may be traced, so that a sweep over it compiles once."""
-    direction, opt_state = _adam.update(grads, opt_state)
-    return optax.apply_updates(params, jax.tree.map(lambda d: -lr * d, direction)), opt_state
+    """One step of Adam, or none where `diverged` []. `lr` may be traced, so that a sweep over it compiles once."""
+    direction, moments = _adam.update(grads, opt_state)
+    moved = optax.apply_updates(params, jax.tree.map(lambda d: -lr * d, direction))
+    return trees.where(diverged, (params, opt_state), (moved, moments))
 
 
-def soft_update(target: Params, online: Params, tau: Array | float) -> Params:
-    """(1 - tau) * target + tau * online, leaf by leaf."""
-    return jax.tree.map(lambda t, o: (1 - tau) * t + tau * o, target, online)
+def overflows(grads: Params) -> Array:
+    """[] bool: whether a gradient is not finite, or so large that Adam could not square it."""
+    return ~jnp.isfinite(optax.tree.norm(grads, squared=True))
+
+
+def soft_update(target: Params, online: Params, tau: Array | float, diverged: Array) -> Params:
+    """(1 - tau) * target + tau * online, leaf by leaf; `target` where `diverged` []."""
+    return trees.where(diverged, target, jax.tree.map(lambda t, o: (1 - tau) * t + tau * o, target, online))

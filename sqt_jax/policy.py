@@ -18,7 +18,8 @@ import numpy as np
 
 from sqt_jax.algorithms import ALGORITHMS, agent_of, make_config
 from sqt_jax.config import Config
-from sqt_jax.types import Agent, Array, Environment, Params, State
+from sqt_jax.trees import by_path, from_paths
+from sqt_jax.types import Agent, Array, Environment, State
 
 
 def save_policy(directory: Path | str, config: Config, env: Environment, agent_state: State) -> None:
@@ -32,7 +33,7 @@ def save_policy(directory: Path | str, config: Config, env: Environment, agent_s
     sizes = {"observation_size": env.observation_size, "action_size": env.action_size}
     (directory / "config.json").write_text(json.dumps(config.flat() | sizes, indent=1) + "\n")
     agent = agent_of(config, env)
-    arrays = _by_path(jax.device_get(agent.policy(agent_state)))
+    arrays = by_path(jax.device_get(agent.policy(agent_state)))
     (directory / "act.stablehlo").write_bytes(_exported(agent, env.observation_size))
     for member in range(next(iter(arrays.values())).shape[0]):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
@@ -51,12 +52,12 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
     config = make_config(**settings)
     agent = ALGORITHMS[config.algo].make_agent(config.agent, *sizes)
     expected = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
-    shapes = {name: leaf.shape for name, leaf in _by_path(expected).items()}
+    shapes = {name: leaf.shape for name, leaf in by_path(expected).items()}
     with np.load(directory / f"member_{member}.npz", allow_pickle=False) as file:
         arrays = {name: jnp.asarray(file[name]) for name in file.files}
     if {name: array.shape for name, array in arrays.items()} != shapes:
         raise ValueError(f"{directory}: member {member} does not hold a policy of {config.algo} for sizes {sizes}")
-    params = jax.tree.unflatten(jax.tree.structure(expected), [arrays[name] for name in shapes])
+    params = from_paths(expected, arrays)
 
     @jax.jit
     def policy(obs: Array) -> Array:
@@ -70,16 +71,10 @@ def _exported(agent: Agent, observation_size: int) -> bytes:
     policy = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
 
     def act(arrays: dict[str, Array], obs: Array) -> Array:
-        params = jax.tree.unflatten(jax.tree.structure(policy), [arrays[name] for name in _by_path(policy)])
+        params = from_paths(policy, arrays)
         return agent.policy_action(params, obs)
 
     (batch,) = jax.export.symbolic_shape("batch")
     obs = jax.ShapeDtypeStruct((batch, observation_size), jnp.float32)
-    exported = jax.export.export(jax.jit(act), platforms=("cpu", "cuda", "tpu"))(_by_path(policy), obs)
+    exported = jax.export.export(jax.jit(act), platforms=("cpu", "cuda", "tpu"))(by_path(policy), obs)
     return bytes(exported.serialize())
-
-
-def _by_path(tree: Params) -> dict[str, Any]:
-    """Leaves by their path, "params/layer0/kernel", in the order of the tree."""
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -70,4 +70,10 @@ def uniform(capacity: int, batch_size: int, observation_size: int, action_size: 
     def feedback(state: UniformState, index: Array, td_error: Array, gradient_steps: Array) -> UniformState:
         return state  # every row stays as likely as any other
 
-    return Replay(init, insert, sample, feedback)
+    def storage(state: UniformState) -> Array:
+        return state.storage
+
+    def with_storage(state: UniformState, rows: Array) -> UniformState:
+        return state._replace(storage=rows)
+
+    return Replay(init, insert, sample, feedback, storage, with_storage)

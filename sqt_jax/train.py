@@ -53,6 +53,7 @@ class TrainState(NamedTuple):
     replay: State
     key: Array  # the member's own; every draw folds a counter into it
     env_steps: Array  # [] int32: transitions so far
+    diverged_at: Array  # [] int32: the env_steps at which the agent diverged and was frozen; -1: it has not
     means: Means  # of the updates' metrics, since `new_interval`
 
 
@@ -102,6 +103,7 @@ def make_trainer(
             replay=replay_state,
             key=own_key,
             env_steps=jnp.zeros((), jnp.int32),
+            diverged_at=jnp.full((), -1, jnp.int32),
             means=Means.start(metrics),
         )
 
@@ -134,7 +136,17 @@ def make_trainer(
         carry = (agent_state, replay_state, state.means)
         agent_state, replay_state, means = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, carry)
         env_steps = state.env_steps + num_envs
-        return TrainState(agent_state, timestep, episodes, replay_state, state.key, env_steps, means)
+        newly = agent_state.diverged & (state.diverged_at < 0)
+        return TrainState(
+            agent=agent_state,
+            timestep=timestep,
+            episodes=episodes,
+            replay=replay_state,
+            key=state.key,
+            env_steps=env_steps,
+            diverged_at=jnp.where(newly, env_steps, state.diverged_at),
+            means=means,
+        )
 
     def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> TrainState:
         """`num_steps` lockstep steps, each of E transitions; without `learn`, random actions and no updates.

@@ -83,12 +83,17 @@ class Agent(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """A store of transitions as pure functions of one member's state."""
+    """A store of transitions as pure functions of one member's state.
+
+    The k-th transition ever inserted lies in row k mod capacity of the storage.
+    """
 
     init: Callable[[], State]
     insert: Callable[[State, Transition], State]  # E new transitions at once
     sample: Callable[[State, Array], tuple[Transition, Array]]  # (state, key) -> B transitions, their rows [B]
     feedback: Callable[[State, Array, Array, Array], State]  # (state, rows [B], td_error [B], gradient_steps) -> state
+    storage: Callable[[State], Array]  # state -> the rows [capacity, W]: nearly all of its bytes
+    with_storage: Callable[[State, Array], State]  # the state with other rows
 
 
 class Scalars(NamedTuple):

@@ -20,7 +20,7 @@ def test_defaults_leave_all_settings_to_the_algorithm():
     assert (options.algo, options.env, options.seeds) == ("sac_sqt", "ant", (0, 1, 2, 3, 4))
     assert options.settings == {} and options.sweep == {}
     assert (options.preset, options.out, options.name) == ("paper", "runs", None)
-    assert options.tensorboard and not options.quiet
+    assert options.tensorboard is options.checkpoint_every is options.resume is None and not options.quiet
 
 
 def test_settings_are_parsed_by_type():

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.loop import train_loop
+from experiments.loop import Position, checkpoint_steps, train_loop
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation
 from sqt_jax.rollout import Episodes
@@ -12,7 +12,6 @@ from sqt_jax.train import Sweep, TrainState
 
 
 class FakeAgent(NamedTuple):
-    params: jnp.ndarray  # [S]
     gradient_steps: jnp.ndarray  # []
 
 
@@ -31,12 +30,11 @@ class Recorder:
         self.calls.append((steps, learn))
         self.done += steps * self.train.num_envs
         self.now += steps / 100
-        params = state.agent.params
-        if self.breaks_at is not None and self.done >= self.breaks_at:
-            params = params.at[1].set(jnp.nan)
+        broken = self.breaks_at is not None and self.done >= self.breaks_at
         return state._replace(
-            agent=FakeAgent(params, state.agent.gradient_steps + steps * learn),
+            agent=FakeAgent(state.agent.gradient_steps + steps * learn),
             env_steps=jnp.int32(self.done),
+            diverged_at=np.array([-1, self.breaks_at if broken else -1]),
             means=state.means + steps * learn,
         )
 
@@ -47,9 +45,14 @@ class Recorder:
         self.now += 0.5
         return Evaluation(np.array([[self.done, self.done + 2], [0.0, 0.0]]), np.full((2, 2), 10))
 
-    def run(self, stop=lambda: False):
-        agent = FakeAgent(jnp.zeros(2), jnp.zeros((), jnp.int32))
-        state = TrainState(agent, None, Episodes.start(1), None, None, jnp.int32(0), means=jnp.zeros(2))
+    def run(self, stop=lambda: False, **options):
+        self.saved = []
+        agent = FakeAgent(jnp.zeros((), jnp.int32))
+        at = options.get("start", Position()).env_steps
+        self.done = at
+        state = TrainState(
+            agent, None, Episodes.start(1), None, None, jnp.int32(at), np.full(2, -1), means=jnp.zeros(2)
+        )
         return train_loop(
             self.sweep,
             state,
@@ -59,6 +62,8 @@ class Recorder:
             display=self,
             stop=stop,
             clock=lambda: self.now,
+            save=lambda state, position: self.saved.append(position),
+            **options,
         )
 
 
@@ -133,12 +138,61 @@ def test_a_run_stopped_before_its_last_evaluation_is_interrupted():
     assert outcome.interrupted and outcome.env_steps == 2_000
 
 
-def test_a_member_with_numbers_that_are_not_finite_is_named_once():
+def test_a_member_that_diverges_is_named_once_and_its_later_returns_do_not_count():
     recorder = Recorder(TRAIN, breaks_at=800)
     outcome = recorder.run()
-    assert outcome.diverged == {1: 1_000}
-    assert recorder.messages == ["member 1 diverged: not all its numbers are finite at step 1,000"]
+    assert outcome.diverged == {1: 800}
+    assert recorder.messages == ["member 1 diverged at step 800: it stays as it was before, the others go on"]
     assert not outcome.interrupted and outcome.env_steps == 2_000
     for report in recorder.reports:
         assert np.isnan(report.returns[1]).all() == (report.env_steps >= 1_000)
         assert np.isfinite(report.returns[0]).all()
+
+
+def test_checkpoints_lie_at_their_interval_and_at_the_end():
+    assert checkpoint_steps(300, 0, 1_000) == [300, 600, 900, 1_000]
+    assert checkpoint_steps(300, 600, 900) == [900]
+    assert checkpoint_steps(300, 1_000, 1_000) == checkpoint_steps(0, 0, 1_000) == []
+
+
+def test_a_checkpoint_follows_the_evaluation_of_its_step():
+    recorder = Recorder(TRAIN)
+    recorder.run(checkpoint_every=250)
+    assert [(at.env_steps, at.evaluated) for at in recorder.saved] == [
+        (250, 0), (500, 500), (750, 500), (1_000, 1_000), (1_250, 1_000), (1_500, 1_500), (1_750, 1_500), (2_000, 2_000)
+    ]  # fmt: skip
+    assert recorder.saved[-1].wall_seconds == pytest.approx(recorder.now)
+
+
+def test_without_checkpoints_nothing_is_saved():
+    recorder = Recorder(TRAIN)
+    recorder.run(stop=lambda: recorder.done >= 1_100)
+    assert recorder.saved == []
+
+
+def test_an_interrupted_run_is_saved_before_what_there_is_is_reported():
+    recorder = Recorder(TRAIN)
+    outcome = recorder.run(stop=lambda: recorder.done >= 1_100, checkpoint_every=1_000)
+    last = recorder.saved[-1]
+    assert (last.env_steps, last.evaluated) == (outcome.env_steps, 1_000)
+
+
+@pytest.mark.parametrize(
+    ("at", "evaluated", "left"), [(1_200, 1_000, [1_500, 2_000]), (1_000, 500, [1_000, 1_500, 2_000])]
+)
+def test_a_run_goes_on_where_it_stood(at, evaluated, left):
+    recorder = Recorder(TRAIN)
+    start = Position(at, evaluated, ((1, 800),), 7.0)
+    outcome = recorder.run(start=start)
+    assert [report.env_steps for report in recorder.reports] == left
+    assert sum(steps for steps, _ in recorder.calls) == 2_000 - at
+    assert outcome.diverged == {1: 800} and recorder.messages == []
+    assert outcome.wall_seconds == pytest.approx(7 + recorder.now)
+    assert all(np.isnan(report.returns[1]).all() for report in recorder.reports)
+
+
+def test_a_run_that_is_done_stays_as_it_is():
+    recorder = Recorder(TRAIN)
+    outcome = recorder.run(start=Position(2_000, 2_000, (), 5.0), checkpoint_every=250)
+    assert recorder.calls == recorder.reports == recorder.saved == []
+    assert (outcome.env_steps, outcome.interrupted) == (2_000, False)

@@ -1,6 +1,5 @@
 import csv
 import json
-from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,13 +7,12 @@ import numpy as np
 import pytest
 
 from experiments import records
+from experiments.described import make_members
 from experiments.loop import Outcome, Report
 from experiments.records import (
     EVALUATION_COLUMNS,
     Records,
     RunExists,
-    default_name,
-    make_members,
     read_evaluations,
     score,
     summarise,
@@ -113,8 +111,8 @@ def test_an_interval_without_an_evaluation_is_a_row_of_metrics_alone(tmp_path):
 
 
 def test_a_directory_with_a_run_is_refused_and_left_alone(tmp_path):
-    with Records(tmp_path / "run", members_of(), [], tensorboard=False) as records:
-        records.config({"settings": {}})
+    with Records(tmp_path / "run", members_of(), [], tensorboard=False):
+        pass
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     with pytest.raises(RunExists):
         Records(tmp_path / "run", members_of(), [], tensorboard=False)
@@ -200,14 +198,6 @@ def test_events_for_tensorboard_are_written_per_member(tmp_path):
     assert b"eval/return_mean" in events.read_bytes() and b"train/q_std" in events.read_bytes()
     (events,) = second.iterdir()
     assert b"eval/return_mean" in events.read_bytes() and b"train/q_std" not in events.read_bytes()
-
-
-def test_default_name_tells_what_differs():
-    now = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
-    assert default_name({}, now) == "20250102T030405Z"
-    name = default_name({"preset": "quick", "hidden": (64, 32), "lr": 0.001, "seeds": (0, 1)}, now)
-    assert name == "preset=quick_hidden=64+32_lr=0.001_seeds=0+1_20250102T030405Z"
-    assert len(default_name({"seeds": tuple(range(1000))}, now)) < 200
 
 
 def test_only_a_runs_own_files_are_removed(tmp_path):

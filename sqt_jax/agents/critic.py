@@ -10,10 +10,13 @@ import jax.numpy as jnp
 from sqt_jax import losses, q_targets
 from sqt_jax.config import AgentConfig
 from sqt_jax.networks import Network
-from sqt_jax.optimizers import adam_step
+from sqt_jax.optimizers import adam_step, overflows
 from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
 
 AgentState = TypeVar("AgentState", bound=Any)
+
+# A value of this size is a divergence long before it is infinite: no task here has returns near it.
+LARGEST_VALUE = 1e9
 
 
 def draw_subset(key: Array, config: AgentConfig) -> Array:
@@ -83,12 +86,14 @@ def update(
     Args:
       apply: parameters -> q [N, B], the critics at the batch's (s, a).
       loss: q [N, B] -> [].
-      state: an agent's state, with fields `critic`, `critic_opt` and `scalars`.
+      state: an agent's state, with fields `critic`, `critic_opt`, `scalars` and `diverged`.
       target, terms: as `td_target` gives them.
 
     Returns:
       state, td_error [B] (the largest |Q_i - target| over the critics), metrics. `q_std` is
       eq. 18's std[B]: the mean over the batch of the std over the online critics at (s, a).
+      The agent has diverged where the loss or a gradient is not finite or a value passes `LARGEST_VALUE`: the critics
+      stay as they were, and td_error is 0.
     """
 
     def loss_fn(params):
@@ -96,8 +101,10 @@ def update(
         return loss(q), q
 
     (loss_value, q), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.critic)
-    critic, critic_opt = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr)
-    td_error = jnp.max(jnp.abs(q - target), axis=0)
+    within = jnp.isfinite(loss_value) & jnp.all(jnp.abs(q) < LARGEST_VALUE)  # a NaN is not
+    diverged = state.diverged | ~within | overflows(grads)
+    critic, critic_opt = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr, diverged)
+    td_error = jnp.where(diverged, 0.0, jnp.max(jnp.abs(q - target), axis=0))
     disagrees = config.ensemble_size > 1
     metrics = {
         "critic_loss": loss_value,
@@ -107,7 +114,7 @@ def update(
         "td_target": jnp.mean(target),
         "penalty": jnp.mean(terms["penalty"]),
     }
-    return state._replace(critic=critic, critic_opt=critic_opt), td_error, metrics
+    return state._replace(critic=critic, critic_opt=critic_opt, diverged=diverged), td_error, metrics
 
 
 def update_by_squares(

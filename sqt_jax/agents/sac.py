@@ -10,7 +10,7 @@ from sqt_jax import losses, networks
 from sqt_jax.agents import critic as critics
 from sqt_jax.agents.actions import Actions
 from sqt_jax.config import AgentConfig
-from sqt_jax.optimizers import adam_init, adam_step, soft_update
+from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
 from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
 
 
@@ -24,6 +24,7 @@ class SACState(NamedTuple):
     temperature_opt: optax.OptState
     scalars: Scalars
     gradient_steps: Array  # [] int32: updates done
+    diverged: Array  # [] bool: nothing moves any more (`critic.update`)
 
 
 class SACNoise(NamedTuple):
@@ -90,6 +91,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             temperature_opt=adam_init(log_temperature),
             scalars=scalars,
             gradient_steps=jnp.zeros((), jnp.int32),
+            diverged=jnp.zeros((), bool),
         )
 
     def policy(state: SACState) -> Params:
@@ -124,15 +126,17 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             return jnp.mean(temperature(state) * log_prob - losses.actor_value(q, config.actor_reduce)), log_prob
 
         (loss, log_prob), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
-        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr)
+        diverged = state.diverged | overflows(grads)
+        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
         metrics = {"actor_loss": loss, "entropy": -jnp.mean(log_prob), "temperature": temperature(state)}
-        state = state._replace(actor=actor, actor_opt=actor_opt)
+        state = state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged)
         return update_temperature(state, log_prob) if config.learn_temperature else state, metrics
 
     def update_temperature(state: SACState, log_prob: Array) -> SACState:
         grad = jax.grad(losses.temperature_loss)(state.log_temperature, log_prob, target_entropy)
-        log_temperature, opt = adam_step(state.log_temperature, state.temperature_opt, grad, state.scalars.lr)
-        return state._replace(log_temperature=log_temperature, temperature_opt=opt)
+        diverged = state.diverged | overflows(grad)
+        log_temperature, opt = adam_step(state.log_temperature, state.temperature_opt, grad, state.scalars.lr, diverged)
+        return state._replace(log_temperature=log_temperature, temperature_opt=opt, diverged=diverged)
 
     def update_with_noise(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
         state, td_error, metrics = update_critic(state, batch, noise)
@@ -143,7 +147,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
 
         due = gradient_steps % config.policy_delay == 0  # a scalar that members share: a real branch under vmap
         state, actor_metrics = jax.lax.cond(due, update_actor, skip, state, batch, noise)
-        target_critic = soft_update(state.target_critic, state.critic, state.scalars.tau)
+        target_critic = soft_update(state.target_critic, state.critic, state.scalars.tau, state.diverged)
         state = state._replace(target_critic=target_critic, gradient_steps=gradient_steps)
         return state, td_error, metrics | actor_metrics
 

@@ -10,7 +10,7 @@ from sqt_jax import losses, networks
 from sqt_jax.agents import critic as critics
 from sqt_jax.agents.actions import Actions, Output
 from sqt_jax.config import AgentConfig
-from sqt_jax.optimizers import adam_init, adam_step, soft_update
+from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
 from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
 
 
@@ -23,6 +23,7 @@ class TD3State(NamedTuple):
     critic_opt: optax.OptState
     scalars: Scalars
     gradient_steps: Array  # [] int32: updates done
+    diverged: Array  # [] bool: nothing moves any more (`critic.update`)
 
 
 class TD3Noise(NamedTuple):
@@ -97,6 +98,7 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             critic_opt=adam_init(critic),
             scalars=(scalars or config.scalars()).as_arrays(),
             gradient_steps=jnp.zeros((), jnp.int32),
+            diverged=jnp.zeros((), bool),
         )
 
     def policy(state: TD3State) -> Params:
@@ -126,14 +128,15 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             return -jnp.mean(losses.actor_value(q, config.actor_reduce))
 
         loss, grads = jax.value_and_grad(loss_fn)(state.actor)
-        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr)
-        return state._replace(actor=actor, actor_opt=actor_opt), loss
+        diverged = state.diverged | overflows(grads)
+        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
+        return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), loss
 
     def update_targets(state: TD3State) -> TD3State:
         tau = state.scalars.tau
         return state._replace(
-            target_actor=soft_update(state.target_actor, state.actor, tau),
-            target_critic=soft_update(state.target_critic, state.critic, tau),
+            target_actor=soft_update(state.target_actor, state.actor, tau, state.diverged),
+            target_critic=soft_update(state.target_critic, state.critic, tau, state.diverged),
         )
 
     def update_with_noise(state: TD3State, batch: Transition, noise: TD3Noise) -> tuple[TD3State, Array, Metrics]:

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sqt_jax import losses, sale
+from sqt_jax import losses, sale, trees
 from sqt_jax.agents import assessment, td3
 from sqt_jax.agents import critic as critics
 from sqt_jax.agents.actions import Actions, Output
 from sqt_jax.config import AgentConfig
-from sqt_jax.optimizers import adam_init, adam_step
+from sqt_jax.optimizers import adam_init, adam_step, overflows
 from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
 
 Noise = Any  # what the way of acting draws; it has a `subset` of critics
@@ -67,6 +67,7 @@ class TD7State(NamedTuple):
     checkpoints: assessment.Checkpoints | None  # none where policies are not assessed
     scalars: Scalars
     gradient_steps: Array  # [] int32: updates done
+    diverged: Array  # [] bool: nothing moves any more (`critic.update`)
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
@@ -102,6 +103,7 @@ def make_sale_agent(
             checkpoints=assessment.start(Policy(actor, encoder)) if assessed else None,
             scalars=(scalars or config.scalars()).as_arrays(),
             gradient_steps=jnp.zeros((), jnp.int32),
+            diverged=jnp.zeros((), bool),
         )
 
     def learner(state: TD7State) -> Policy:
@@ -126,7 +128,12 @@ def make_sale_agent(
         if not state.checkpoints:
             return state
         checkpoints = assessment.assess(
-            config, state.checkpoints, learner(state), state.gradient_steps, episode_return[0], ended[0]
+            config,
+            state.checkpoints,
+            learner(state),
+            state.gradient_steps,
+            episode_return[0],
+            ended[0] & ~state.diverged,
         )
         return state._replace(checkpoints=checkpoints)
 
@@ -153,8 +160,9 @@ def make_sale_agent(
             return losses.encoder_loss(zsa, encoder_net.zs(encoder, batch.next_obs))
 
         loss, grads = jax.value_and_grad(loss_fn)(state.encoder)
-        encoder, encoder_opt = adam_step(state.encoder, state.encoder_opt, grads, state.scalars.lr)
-        return state._replace(encoder=encoder, encoder_opt=encoder_opt), loss
+        diverged = state.diverged | overflows(grads)
+        encoder, encoder_opt = adam_step(state.encoder, state.encoder_opt, grads, state.scalars.lr, diverged)
+        return state._replace(encoder=encoder, encoder_opt=encoder_opt, diverged=diverged), loss
 
     def update_critic(state: TD7State, batch: Transition, noise: Noise) -> tuple[TD7State, Array, Metrics]:
         target, terms = td_target(state, batch, noise)
@@ -168,8 +176,10 @@ def make_sale_agent(
             target,
             terms,
         )
-        bounds = state.value_bounds
-        return state._replace(value_bounds=bounds.track(target) if bounds else None), td_error, metrics
+        bounds = state.value_bounds and trees.where(
+            state.diverged, state.value_bounds, state.value_bounds.track(target)
+        )
+        return state._replace(value_bounds=bounds), td_error, metrics
 
     def update_actor(state: TD7State, batch: Transition, noise: Noise) -> tuple[TD7State, Metrics]:
         zs = encoder_net.zs(state.fixed_encoder, batch.obs)
@@ -184,21 +194,23 @@ def make_sale_agent(
             return -jnp.mean(value), log_prob
 
         (loss, log_prob), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
-        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr)
+        diverged = state.diverged | overflows(grads)
+        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
         metrics = {"actor_loss": loss}
         if acting.entropy:
             metrics |= {"entropy": -jnp.mean(log_prob), "temperature": state.scalars.temperature}
-        return state._replace(actor=actor, actor_opt=actor_opt), metrics
+        return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), metrics
 
     def copy_targets(state: TD7State) -> TD7State:
         bounds = state.value_bounds
-        return state._replace(
+        copied = state._replace(
             target_actor=state.actor,
             target_critic=state.critic,
             fixed_encoder_target=state.fixed_encoder,
             fixed_encoder=state.encoder,
             value_bounds=bounds.put_in_use() if bounds else None,
         )
+        return trees.where(state.diverged, state, copied)
 
     def update_with_noise(state: TD7State, batch: Transition, noise: Noise) -> tuple[TD7State, Array, Metrics]:
         encoder_metrics = {}
