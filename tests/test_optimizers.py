@@ -1,4 +1,4 @@
-"""Adam against optax's own, and the soft step of target networks."""
+"""Adam against optax's own, the soft step of target networks, and that neither moves what has diverged."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import optax
 import pytest
 
-from sqt_jax.optimizers import adam_init, adam_step, soft_update
+from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
 
 PARAMS = {"kernel": jnp.array([[1.0, -2.0]]), "bias": jnp.array([0.5, 0.0])}
 
@@ -18,7 +18,7 @@ def loss(params):
 def run(lr, steps, step=adam_step):
     params, opt_state = PARAMS, adam_init(PARAMS)
     for _ in range(steps):
-        params, opt_state = step(params, opt_state, jax.grad(loss)(params), lr)
+        params, opt_state = step(params, opt_state, jax.grad(loss)(params), lr, jnp.array(False))
     return params, opt_state
 
 
@@ -60,4 +60,21 @@ def test_learning_rate_zero_moves_nothing_but_the_moments():
 @pytest.mark.parametrize(("tau", "expected"), [(0.0, [1, 2]), (1.0, [5, -2]), (0.25, [2, 1])])
 def test_soft_update(maybe_jit, tau, expected):
     target, online = {"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([5.0, -2.0])}
-    np.testing.assert_allclose(maybe_jit(soft_update)(target, online, tau)["w"], expected, rtol=1e-6)
+    np.testing.assert_allclose(maybe_jit(soft_update)(target, online, tau, jnp.array(False))["w"], expected, rtol=1e-6)
+
+
+def test_nothing_moves_where_an_agent_has_diverged(maybe_jit):
+    params, opt_state = run(0.1, 2)
+    grads = jax.tree.map(lambda p: jnp.full(p.shape, jnp.nan), PARAMS)
+    after = maybe_jit(adam_step)(params, opt_state, grads, 0.1, jnp.array(True))
+    jax.tree.map(np.testing.assert_array_equal, after, (params, opt_state))
+    kept = maybe_jit(soft_update)(params, grads, 0.5, jnp.array(True))
+    jax.tree.map(np.testing.assert_array_equal, kept, params)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, False), (1e15, False), (1e25, True), (jnp.inf, True), (-jnp.inf, True), (jnp.nan, True)],
+)
+def test_gradients_overflow_where_adam_could_not_square_them(maybe_jit, value, expected):
+    assert maybe_jit(overflows)({"kernel": jnp.ones((2, 2)), "bias": jnp.array([1.0, value])}) == expected

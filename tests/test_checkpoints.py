@@ -1,0 +1,225 @@
+"""Checkpoints: exact, written once, whole or not there, and no danger to the run."""
+
+import errno
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_envs
+import pytest
+from test_train import identical, make, start
+
+from experiments import checkpoints, files
+from experiments.checkpoints import Checkpoints
+from experiments.loop import Position
+from sqt_jax.algorithms import ALGORITHMS, replay_of
+
+SEEDS = (0, 1, 2)
+CAPACITY = 64  # less than the steps: the ring goes round
+LENGTHS = {"evaluations": 10, "metrics": 20}
+
+
+class Case:
+    """A small sweep, and states of it."""
+
+    def __init__(self, algo="td3_sqt"):
+        small = {"embedding_size": 16} if ALGORITHMS[algo].assessed else {}
+        self.config, _, self.sweep = make(algo, replay_capacity=CAPACITY, **small)
+        self.replay = replay_of(self.config, probe_envs.one_step())
+        self.template = jax.eval_shape(lambda: start(self.config, self.sweep))
+
+    def trained(self, steps):
+        state = self.sweep.advance(start(self.config, self.sweep, SEEDS), 40, False)
+        return self.sweep.advance(state, steps - 40, True) if steps > 40 else state
+
+    def store(self, folder, keep=2):
+        self.said = []
+        return Checkpoints(folder / "checkpoint", self.replay, keep, self.said.append)
+
+    def saved(self, store, *steps):
+        """Saves at these steps of one training; the state at the last of them."""
+        state = self.trained(40)
+        for at in steps:
+            state = self.sweep.advance(state, at - int(state.env_steps), at > 40)
+            store.save(state, position(at), LENGTHS)
+        store.wait()
+        return state
+
+
+def position(at):
+    return Position(at, 40, ((1, 30),), 2.5)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Case()
+
+
+def listing(store):
+    return sorted(path.name for path in store.path.iterdir())
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
+    case = Case(algo)
+    store = case.store(tmp_path)
+    state = case.saved(store, 50, 90)
+    restored = case.store(tmp_path).restore(case.template)
+    assert restored.position == position(90) and restored.lengths == LENGTHS
+    assert identical(restored.state, state)
+    assert identical(case.sweep.advance(restored.state, 30, True), case.sweep.advance(state, 30, True))
+    assert case.said == []
+
+
+def test_a_restored_state_needs_no_new_compilation(case, tmp_path):
+    store = case.store(tmp_path)
+    case.saved(store, 60)
+    compiled = case.sweep.advance._cache_size()
+    case.sweep.advance(store.restore(case.template).state, 3, True)
+    assert case.sweep.advance._cache_size() == compiled
+
+
+def test_training_may_go_on_while_a_checkpoint_is_written(case, tmp_path):
+    store = case.store(tmp_path)
+    state = case.trained(60)
+    store.save(state, position(60), LENGTHS)
+    case.sweep.advance(state, 20, True)  # donates the memory of what is being written
+    store.wait()
+    assert identical(store.restore(case.template).state, case.trained(60))
+
+
+def test_rows_are_written_once_and_only_those_that_are_filled(case, tmp_path):
+    store = case.store(tmp_path)
+    case.saved(store, 45, 60)
+    rows = sorted(store.path.glob("rows_*"))
+    assert [path.name for path in rows] == ["rows_0000000000_0000000045.bin", "rows_0000000045_0000000060.bin"]
+    width = 2 * 1 + 1 + 2
+    assert sum(path.stat().st_size for path in rows) == 60 * len(SEEDS) * width * 4
+    assert case.store(tmp_path).sizes(case.template)[1] == len(SEEDS) * width * 4
+
+
+def test_rows_go_to_the_disk_in_pieces(case, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "PIECE_BYTES", 10 * len(SEEDS) * 5 * 4)
+    store = case.store(tmp_path)
+    state = case.saved(store, 60, 100)
+    sizes = [path.stat().st_size for path in store.path.glob("rows_*")]
+    assert max(sizes) <= checkpoints.PIECE_BYTES and len(sizes) >= 10
+    assert identical(store.restore(case.template).state, state)
+
+
+def test_the_latest_are_kept_with_the_rows_they_need(case, tmp_path):
+    store = case.store(tmp_path, keep=2)
+    case.saved(store, 50, 60, 70, 80, 130)
+    kept = listing(store)
+    assert [name for name in kept if name.startswith("step")] == ["step_0000000080", "step_0000000130"]
+    # The checkpoint at 80 needs rows 16 to 80; those up to 50 came in one file.
+    assert [name for name in kept if name.startswith("rows")][0] == "rows_0000000000_0000000050.bin"
+    store = case.store(tmp_path / "one", keep=1)
+    store.path.parent.mkdir()
+    case.saved(store, 50, 60, 70, 80, 130)
+    assert listing(store)[0] == "rows_0000000064_0000000070.bin"  # rows 66 to 130, of the files that hold them
+
+
+def test_a_step_is_saved_once(case, tmp_path):
+    store = case.store(tmp_path)
+    state = case.saved(store, 60)
+    before = {path: path.stat().st_mtime_ns for path in store.path.rglob("*")}
+    store.save(state, position(60), LENGTHS)
+    store.wait()
+    assert {path: path.stat().st_mtime_ns for path in store.path.rglob("*")} == before
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def disk_is_full_for_rows(monkeypatch):
+    monkeypatch.setattr(files, "whole_file", full)
+
+
+def disk_is_full_for_the_state(monkeypatch):
+    class Orbax:
+        save = full
+
+    monkeypatch.setattr(checkpoints, "_orbax", Orbax)
+
+
+def disk_is_full_for_the_manifest(monkeypatch):
+    def whole_file(path, original=files.whole_file):
+        return full() if path.name == "manifest.json" else original(path)
+
+    monkeypatch.setattr(files, "whole_file", whole_file)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [disk_is_full_for_rows, disk_is_full_for_the_state, disk_is_full_for_the_manifest],
+    ids=lambda f: f.__name__,
+)
+def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
+    store = case.store(tmp_path)
+    state = case.saved(store, 60)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        fault(monkeypatch)
+        state = case.sweep.advance(state, 10, True)
+        store.save(state, position(70), LENGTHS)
+        store.wait()
+    (warning,) = case.said
+    assert "no checkpoint at step 70" in warning and "No space left" in warning
+    assert "the one at step 60 is whole" in warning
+    assert not [name for name in listing(store) if name.endswith(".part")]
+    # The older one is as good as before, and with room again there is a newer one.
+    state = case.sweep.advance(state, 10, True)
+    assert identical(case.store(tmp_path).restore(case.template).state, case.trained(60))
+    store = case.store(tmp_path)
+    store.restore(case.template)
+    store.save(state, position(80), LENGTHS)
+    store.wait()
+    assert identical(case.store(tmp_path).restore(case.template).state, case.trained(80))
+
+
+def test_room_that_comes_back_is_used_by_the_same_process(case, tmp_path):
+    store = case.store(tmp_path)
+    state = case.saved(store, 60)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        disk_is_full_for_the_state(monkeypatch)
+        state = case.sweep.advance(state, 10, True)
+        store.save(state, position(70), LENGTHS)
+        store.wait()
+    state = case.sweep.advance(state, 10, True)
+    store.save(state, position(80), LENGTHS)
+    store.wait()
+    assert identical(case.store(tmp_path).restore(case.template).state, case.trained(80))
+
+
+def test_where_nothing_was_saved_nothing_is_restored(case, tmp_path):
+    assert case.store(tmp_path).restore(case.template) is None
+
+
+def test_what_a_dead_process_left_half_written_is_removed(case, tmp_path):
+    store = case.store(tmp_path)
+    state = case.saved(store, 60)
+    (store.path / "step_0000000070.part" / "state").mkdir(parents=True)
+    (store.path / "rows_0000000060_0000000070.bin").write_bytes(b"x")
+    (store.path / "rows_0000000070_0000000075.bin.part").write_bytes(b"x")
+    (store.path / "notes.txt").write_text("not ours")
+    restored = case.store(tmp_path).restore(case.template)
+    assert identical(restored.state, state)
+    assert listing(store) == ["notes.txt", "rows_0000000000_0000000060.bin", "step_0000000060"]
+
+
+def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
+    store = case.store(tmp_path)
+    case.saved(store, 60)
+    other = Case("sac")
+    assert other.store(tmp_path).restore(other.template) is None
+    assert other.said == ["the checkpoint at step 60 cannot be used: it holds another training state than this run's"]
+
+
+def test_keys_come_back_as_keys(case, tmp_path):
+    store = case.store(tmp_path)
+    case.saved(store, 50)
+    key = store.restore(case.template).state.key
+    assert jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(case.trained(40).key))
