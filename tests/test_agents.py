@@ -542,3 +542,43 @@ def test_a_random_subset_of_critics_makes_the_target(algo):
     for (i, j), target in pairs.items():
         np.testing.assert_allclose(target, np.minimum(pairs[i, i], pairs[j, j]), rtol=1e-5, atol=1e-6)
     assert not np.array_equal(pairs[0, 0], pairs[1, 1])
+
+
+HUGE = 1e12  # finite, and too large to be true
+
+
+def with_huge_values(state):
+    """The same state with critics that say so everywhere."""
+    *_, last = sorted(state.critic["params"])
+    layer = state.critic["params"][last]
+    layer = layer | {"bias": layer["bias"] + HUGE}
+    return state._replace(critic={"params": state.critic["params"] | {last: layer}})
+
+
+FAULTS = {
+    "a reward that is no number": lambda state, batch: (state, batch._replace(reward=batch.reward * jnp.nan)),
+    "an infinite observation": lambda state, batch: (state, batch._replace(obs=batch.obs.at[2, 0].set(jnp.inf))),
+    "values beyond all bounds": lambda state, batch: (with_huge_values(state), batch),
+}
+
+
+@every_kind
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_diverged_agent_stays_as_it_was_for_good(algo, fault):
+    def parts(state, *without):
+        return state._replace(**dict.fromkeys(("gradient_steps", "diverged", *without)))
+
+    update, batch = subject(algo).update, make_batch(1)
+    good = run(algo, start(algo), 3)[0][-1]
+    state, bad = FAULTS[fault](good, batch)
+    after, td_error, _ = update(state, bad, KEY)
+    assert after.diverged and not state.diverged
+    assert not np.any(td_error)
+    # TD7's encoder makes its step before the critics', which fail.
+    encoder = [name for name in ("encoder", "encoder_opt") if hasattr(state, name)]
+    assert same(parts(after, *encoder), parts(state, *encoder))
+    assert all(np.isfinite(leaf).all() for leaf in numbers(after))
+    # What comes later, however good, changes nothing.
+    later = update(update(after, batch, KEY)[0], batch, KEY)[0]
+    assert later.diverged and same(parts(later), parts(after))
+    assert later.gradient_steps == good.gradient_steps + 3

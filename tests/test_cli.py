@@ -170,7 +170,7 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
     assert run(tmp_path, "--temperature=0.2,1e38") == 3
     summary = json.loads((tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").read_text())
     assert summary["status"] == "diverged"
-    assert summary["diverged"] == [{"member": 2, "env_steps": 50}, {"member": 3, "env_steps": 50}]
+    assert summary["diverged"] == [{"member": 2, "env_steps": 31}, {"member": 3, "env_steps": 31}]  # the first update
     assert [group["temperature"] for group in summary["groups"]] == [0.2, 1e38]
     assert summary["env_steps"] == 120
     assert "member 2 diverged" in capsys.readouterr().out

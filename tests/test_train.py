@@ -326,3 +326,25 @@ def test_an_environment_may_call_its_fields_as_it_likes():
     config, _, sweep = make("td3", probe_envs.with_a_field_called_size)
     state, metrics = advance(sweep, start(config, sweep), 50, True)
     assert state.timestep.state.task.size.shape == (3, 1) and (metrics["train_episodes"] > 0).all()
+
+
+def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):
+    config, _, sweep = td3
+    whole, seeds = start(config, sweep, range(5)), range(5)
+    whole = sweep.advance(sweep.advance(whole, 40, False), 20, True)
+    hurt = start(config, sweep, seeds)
+    hurt = sweep.advance(sweep.advance(hurt, 40, False), 20, True)
+    before = jax.tree.map(lambda x: np.array(x), hurt.agent)  # copies: the memory is donated
+    storage = hurt.replay.storage.at[2].set(jnp.nan)
+    hurt = sweep.advance(hurt._replace(replay=hurt.replay._replace(storage=storage)), 30, True)
+    whole = sweep.advance(whole, 30, True)
+    np.testing.assert_array_equal(hurt.diverged_at, [-1, -1, 61, -1, -1])
+    np.testing.assert_array_equal(hurt.agent.diverged, np.arange(5) == 2)
+    others = np.array([0, 1, 3, 4])
+    for name in ("actor", "critic", "target_actor", "target_critic", "actor_opt", "critic_opt"):
+        ours, theirs = (numbers(getattr(state.agent, name)) for state in (hurt, whole))
+        for a, b, frozen in zip(ours, theirs, numbers(getattr(before, name)), strict=True):
+            np.testing.assert_array_equal(a[others], b[others])
+            np.testing.assert_array_equal(a[2], frozen[2])
+    np.testing.assert_array_equal(hurt.timestep.obs[others], whole.timestep.obs[others])
+    assert np.isfinite(hurt.timestep.obs).all()

@@ -1,0 +1,152 @@
+"""A run that is gone on with ends as if it had never stopped."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import probe_envs
+import pytest
+from test_cli import rows_of, run
+
+from experiments import checkpoints, records
+from experiments.killtest import differences, result_of
+from experiments.run import main
+
+MEMBERS = ("--penalty_coef=0,0.5", "--checkpoint_every=20")
+
+
+def path_in(out):
+    return out / "ant" / "sac_sqt" / "run"
+
+
+def resume(out, *arguments):
+    return main(["experiments.run", f"--resume={path_in(out)}", *arguments], env=probe_envs.constant_reward(5))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a run without a break."""
+    out = tmp_path_factory.mktemp("whole")
+    assert run(out, *MEMBERS) == 0
+    return out
+
+
+def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
+    """A run that gets a signal when the evaluation or the checkpoint of step `at` has been made."""
+
+    sent = []
+
+    def then(original, env_steps_of):
+        def method(self, *arguments):
+            original(self, *arguments)
+            if env_steps_of(arguments) == at and not sent:  # a second signal would end the process at once
+                sent.append(by)
+                os.kill(os.getpid(), by)
+
+        return method
+
+    with monkeypatch.context() as patch:
+        patch.setattr(records.Records, "report", then(records.Records.report, lambda given: given[0].env_steps))
+        patch.setattr(
+            checkpoints.Checkpoints, "save", then(checkpoints.Checkpoints.save, lambda given: given[1].env_steps)
+        )
+        assert run(out, *MEMBERS) == 130
+    summary = json.loads((path_in(out) / "summary.json").read_text())
+    assert (summary["status"], summary["env_steps"]) == ("interrupted", at)
+
+
+@pytest.mark.parametrize(
+    ("at", "by"),
+    [(0, signal.SIGINT), (20, signal.SIGTERM), (50, signal.SIGTERM), (80, signal.SIGINT), (100, signal.SIGTERM)],
+    ids=["at the first evaluation", "in the warm-up", "at an evaluation", "between two", "at both"],
+)
+def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, capsys, whole, at, by):
+    interrupted(tmp_path, monkeypatch, at, by)
+    assert f"--resume={path_in(tmp_path)}" in capsys.readouterr().out
+    assert resume(tmp_path) == 0
+    assert f"going on with it at step {at}" in capsys.readouterr().out
+    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+    summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
+    assert (summary["status"], summary["env_steps"]) == ("done", 120)
+    seconds = [float(row["wall_seconds"]) for row in rows_of(path_in(tmp_path) / "evaluations.csv")]
+    assert seconds == sorted(seconds)
+    config = json.loads((path_in(tmp_path) / "config.json").read_text())
+    assert [entry["env_steps"] for entry in config["resumed"]] == [at]
+
+
+def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_path, monkeypatch, whole):
+    interrupted(tmp_path, monkeypatch, 80)
+    assert run(tmp_path, *MEMBERS, "--resume") == 0
+    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+    assert run(tmp_path / "new", *MEMBERS, "--resume") == 0
+    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path / "new"))) == []
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path, whole):
+    assert run(tmp_path, *MEMBERS) == 0
+    tables = [path_in(tmp_path) / name for name in ("evaluations.csv", "metrics.csv")]
+    before = [table.read_bytes() for table in tables]
+    assert resume(tmp_path) == 0
+    assert [table.read_bytes() for table in tables] == before
+    assert json.loads((path_in(tmp_path) / "summary.json").read_text())["status"] == "done"
+
+
+def test_a_finished_run_is_gone_on_with_for_more_steps(tmp_path):
+    assert run(tmp_path, *MEMBERS) == 0
+    path = path_in(tmp_path)
+    before = rows_of(path / "evaluations.csv")
+    assert resume(tmp_path, "--steps=200") == 0
+    rows = rows_of(path / "evaluations.csv")
+    assert rows[: len(before)] == before
+    assert [int(row["env_steps"]) for row in rows[::4]] == [0, 50, 100, 120, 150, 200]
+    config = json.loads((path / "config.json").read_text())
+    assert (config["settings"]["steps"], config["replay_rows"]) == (200, 120)
+    assert result_of(path)["rows"].shape[1] >= 120
+    assert int(result_of(path)["replay/size"]) == 120
+    # And again, with the number of steps that it has by now.
+    assert resume(tmp_path, "--steps=200") == 0
+
+
+def test_a_diverged_member_stays_so(tmp_path, capsys):
+    assert run(tmp_path, "--penalty_coef=0,1e38", "--checkpoint_every=20") == 3
+    first = json.loads((path_in(tmp_path) / "summary.json").read_text())["diverged"]
+    assert [entry["member"] for entry in first] == [2, 3]
+    capsys.readouterr()
+    assert resume(tmp_path, "--steps=150") == 3
+    summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
+    assert summary["diverged"] == first and summary["status"] == "diverged"
+    assert "diverged at" not in capsys.readouterr().out  # it is no news
+    late = [row for row in rows_of(path_in(tmp_path) / "evaluations.csv") if row["env_steps"] == "150"]
+    assert [row["return_mean"] for row in late] == ["5.0", "5.0", "", ""]
+
+
+def test_without_checkpoints_a_run_starts_anew(tmp_path, monkeypatch, capsys, whole):
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules[__name__], "MEMBERS", ("--penalty_coef=0,0.5", "--checkpoint_every=0"))
+        interrupted(tmp_path, monkeypatch, 50)
+    assert not (path_in(tmp_path) / "checkpoint").exists()
+    capsys.readouterr()
+    assert resume(tmp_path, "--checkpoint_every=20") == 0
+    assert "going on with it from the start: it has no whole checkpoint" in capsys.readouterr().out
+    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics", ["mjx", "mujoco"])
+@pytest.mark.parametrize("algo", ["td3_sqt", "sac_sqt_tuple", "td7_sqt"])
+def test_the_command_resumes_on_every_physics(tmp_path, algo, physics):
+    command = [sys.executable, "-m", "experiments.run", f"--algo={algo}", "--env=cheetah", f"--physics={physics}"]
+    command += ["--seeds=0,1", "--warmup_steps=50", "--eval_every=60", "--eval_episodes=1", "--batch_size=16"]
+    command += ["--hidden=16,16", "--checkpoint_every=30", "--name=run", "--quiet"]
+
+    def train(folder, *more):
+        done = subprocess.run([*command, f"--out={folder}", *more], capture_output=True, text=True, timeout=600)
+        assert (done.returncode, done.stderr) == (0, "")
+        return folder / "cheetah" / algo / "run"
+
+    whole = train(tmp_path / "whole", "--steps=150", "--replay_capacity=90")
+    train(tmp_path / "parts", "--steps=120", "--replay_capacity=90")
+    parts = train(tmp_path / "parts", "--steps=150", "--replay_capacity=90", "--resume")
+    assert differences(result_of(whole), result_of(parts)) == []
