@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import jax
 
 from experiments import files
+from experiments.flags import MAX_MEMBERS
 from sqt_jax.algorithms import eval_physics_of, make_config
 from sqt_jax.config import Config, ConfigError
 from sqt_jax.types import Scalars
 
 NAME = "config.json"
-MAX_BYTES = 1_000_000
-MAX_MEMBERS = 100_000
+MAX_BYTES = 10_000_000
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "brax", "gymnasium", "numpy", "sqt_jax")
 
 
@@ -88,7 +88,8 @@ def read(path: Path) -> Described:
     try:
         content = files.read_json(path / NAME, MAX_BYTES)
         settings, swept, entries = dict(content["settings"]), list(content["swept"]), list(content["members"])
-        if not set(swept) <= {*Scalars._fields} or not 0 < len(entries) <= MAX_MEMBERS:
+        known = set(swept) <= {*Scalars._fields} and len(set(swept)) == len(swept)
+        if not known or not 0 < len(entries) <= MAX_MEMBERS:
             raise NotDescribed(f"its {NAME} does not describe a run")
         configs = {
             values: make_config(**settings | dict(zip(swept, values, strict=True)))
@@ -99,13 +100,16 @@ def read(path: Path) -> Described:
         for key, kind in kinds.items():
             if not isinstance(content[key], kind):
                 raise NotDescribed(f"its {NAME} does not describe a run")
+        train, rows = members[0].config.train, content["replay_rows"]
+        if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
+            raise NotDescribed(f"its {NAME} names a replay that cannot be (replay_rows)")
     except OSError as error:
         raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None
     except ConfigError as error:
         raise NotDescribed(f"its {NAME} names a setting that cannot be: {error}") from None
     except NotDescribed:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise NotDescribed(f"its {NAME} does not describe a run ({type(error).__name__})") from None
     return Described(members, swept, content)
 

@@ -2,12 +2,15 @@
 
 import fcntl
 import json
+import math
 import os
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+
+MAX_DEPTH = 20  # of what is read from JSON
 
 
 class Busy(Exception):
@@ -44,8 +47,9 @@ def locked(folder: Path) -> Iterator[None]:
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write that gets its name when it is complete and on disk; an older one of that name is replaced."""
     part = path.with_name(path.name + ".part")
+    part.unlink(missing_ok=True)  # a link of that name would be written through
     try:
-        with part.open("wb") as file:
+        with part.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -74,8 +78,10 @@ def crc(path: Path) -> int:
 
 
 def below(folder: Path) -> dict[str, Path]:
-    """The files below a folder by their path in it. Links are among them, and are not followed."""
-    found = {}
+    """The files below a folder by their path in it. Links are among them, and are not followed: not `folder` either."""
+    found: dict[str, Path] = {}
+    if folder.is_symlink():
+        return found
     for parent, folders, names in os.walk(folder):
         for name in [*names, *(name for name in folders if Path(parent, name).is_symlink())]:
             path = Path(parent, name)
@@ -87,8 +93,8 @@ def read_json(path: Path, limit: int) -> Any:
     """The content of a JSON file of at most `limit` bytes.
 
     Raises:
-      ValueError: it is a link, too large, or no JSON.
-      OSError: it cannot be read.
+      ValueError: it is too large or too deep, or no JSON: NaN and infinity are none, and could not be written again.
+      OSError: it is a link or no file, or cannot be read.
     """
     if path.is_symlink() or not path.is_file():
         raise FileNotFoundError(2, "No such file", str(path))
@@ -97,6 +103,24 @@ def read_json(path: Path, limit: int) -> Any:
     if len(content) > limit:
         raise ValueError(f"more than {limit:,} bytes")
     try:
-        return json.loads(content)
+        value = json.loads(content, parse_constant=_finite, parse_float=_finite)
     except RecursionError:
         raise ValueError("too deep") from None
+    if _is_deep(value):
+        raise ValueError("too deep")
+    return value
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no number")
+    return value
+
+
+def _is_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        inner = [item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list)]
+        level = [item for items in inner for item in items]
+    return bool(level)

@@ -7,6 +7,7 @@ the settings are `sqt_jax.algorithms.make_config`'s.
 
 import dataclasses
 import math
+import os
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -25,6 +26,9 @@ EXAMPLE = "python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4"
 DEFAULT_SEEDS = (0, 1, 2, 3, 4)
 MAX_SEED = 2**32 - 1
 MAX_CONFIG_BYTES = 100_000
+MAX_MEMBERS = 10_000
+# What absl understands beside the flags that are defined: another file of flags, and flags that may be unknown.
+ABSL_FLAGS = ("flagfile", "undefok")
 # The run's own flags that a resumed run takes over; the smallest value of each.
 OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "tensorboard": False}
 CHECKPOINT_EVERY = 25_000
@@ -106,6 +110,13 @@ class Options(NamedTuple):
 
 class UsageError(ValueError):
     """A command line that cannot be. The text is one line that names the flag."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain YAML without merge keys (`<<`): a few lines of them can ask for more memory than there is."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        pass
 
 
 class _Flag(NamedTuple):
@@ -249,6 +260,10 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     values = absl_flags.FlagValues()
     values.set_gnu_getopt(True)
     known = [flag for group in FLAGS.values() for flag in group]
+    for word in argv[1:]:
+        name = word.lstrip("-").split("=")[0]
+        if word.startswith("-") and name in ABSL_FLAGS:
+            raise UsageError(f"--{name}: unknown flag; --help lists the flags")
     for flag in known:
         if flag.parse is None:
             absl_flags.DEFINE_boolean(flag.name, None, flag.help, flag_values=values)
@@ -291,13 +306,18 @@ def _file_values(name: str) -> dict[str, Any]:
     try:
         if not path.is_file():
             refuse("takes a file, which this is not" if path.exists() else "there is no such file")
-        if path.stat().st_size > MAX_CONFIG_BYTES:
+        with path.open("rb") as file:
+            text = file.read(MAX_CONFIG_BYTES + 1)
+        if len(text) > MAX_CONFIG_BYTES:
             refuse(f"takes a file of at most {MAX_CONFIG_BYTES} bytes")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
-        refuse("takes a YAML file, which this is not")
+        content = yaml.load(text.decode("utf-8"), _Loader)
+    except UsageError:
+        raise
     except OSError as error:
         refuse(f"cannot be read: {error.strerror}")
+    # Beside its own errors, PyYAML lets pass what Python says of a date, a number or a tag that cannot be.
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError):
+        refuse("takes a YAML file, which this is not")
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         refuse("takes lines like `steps: 100000`")
     arguments = []
@@ -352,8 +372,10 @@ def parse(argv: Sequence[str]) -> Options | None:
         raise UsageError(
             f"--name={name[:40]}: takes up to 200 bytes, no slashes or control characters: it names a folder"
         )
-    if own["out"] == "":
-        raise UsageError("--out=: takes a folder")
+    for folder in ("out", "resume"):
+        given = {"out": own["out"], "resume": resume}[folder]
+        if given is not None and ((folder == "out" and not given) or not _is_path(given)):
+            raise UsageError(f"--{folder}={given[:40]}: takes a folder")
 
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
@@ -374,6 +396,9 @@ def parse(argv: Sequence[str]) -> Options | None:
         else:
             settings[setting] = choices[0]
     sweep = {scalar: sweep[scalar] for scalar in Scalars._fields if scalar in sweep}
+    count = math.prod(map(len, sweep.values())) * len(own["seeds"] or DEFAULT_SEEDS)
+    if count > MAX_MEMBERS:
+        raise UsageError(f"--seeds: takes at most {MAX_MEMBERS} members, seeds times swept values, not {count}")
     return Options(
         algo=own["algo"],
         env=own["env"],
@@ -398,8 +423,16 @@ def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
     return seeds
 
 
+def _is_path(text: str) -> bool:
+    """Whether the system can have a file of that name; a YAML file can ask for others."""
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+
+
 def _refuse_duplicates(name: str, values: Sequence[Any]) -> None:
-    for value in values:
+    for value in values if len(set(values)) < len(values) else ():
         if values.count(value) > 1:
             raise UsageError(f"--{name}: takes each value once, {value} is there {values.count(value)} times")
 

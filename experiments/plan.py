@@ -46,10 +46,14 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     Raises `flags.UsageError` for settings that cannot be, a directory that is taken and too little memory.
     """
     members, swept, path, run = _resumed(options) if options.resume else _named(options)
-    if run is None and not options.overwrite:
+    if run is None:
         try:
-            if records.is_taken(path):
+            if options.overwrite:
+                records.run_alone(path)
+            elif records.is_taken(path):
                 raise flags.UsageError(taken(path))
+        except records.NotARun:
+            raise flags.UsageError(not_a_run(path)) from None
         except OSError as error:
             raise flags.UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
     config = members[0].config
@@ -90,7 +94,7 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
     wanted = described.settings_of(members, swept)
     if options.name is None:
         path, run = resume.latest(folder, wanted)
-    elif not (path / described.NAME).exists():
+    elif not _exists(path / described.NAME):
         return members, swept, path, None  # so that one command starts a run and goes on with it
     else:
         run = resume.named(path, wanted)
@@ -119,7 +123,7 @@ def _output(options: flags.Options, run: Described | None, train: TrainConfig) -
     output = {"tensorboard": True} | defaults
     if run:
         kept = {name: run.content["output"].get(name) for name in output}
-        output |= {name: value for name, value in kept.items() if type(value) is type(output[name]) and value >= 0}
+        output |= {name: value for name, value in kept.items() if _may_be(name, value)}
     output |= {name: getattr(options, name) for name in output if getattr(options, name) is not None}
     if options.checkpoint_every is None:  # the default may not be a multiple
         output["checkpoint_every"] -= output["checkpoint_every"] % train.num_envs
@@ -136,6 +140,21 @@ def _default_name(options: flags.Options) -> str:
     if options.seeds != flags.DEFAULT_SEEDS:
         changed["seeds"] = options.seeds
     return described.default_name(changed, datetime.now(UTC))
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no file can have
+        return False
+
+
+def _may_be(name: str, value: Any) -> bool:
+    return type(value) is type(flags.OUTPUT[name]) and value >= flags.OUTPUT[name]
+
+
+def not_a_run(path: Path) -> str:
+    return f"--overwrite: {path} holds other things than a run; takes a folder with a run alone"
 
 
 def taken(path: Path) -> str:

@@ -83,19 +83,31 @@ def is_taken(path: Path) -> bool:
     return path.is_dir() and any(item.name not in LEFTOVERS for item in path.iterdir())
 
 
-def remove_run(path: Path) -> None:
-    """Removes the run in `path`, if there is one, but for its lock.
+def run_alone(path: Path) -> set[str]:
+    """The names in `path` that `remove_run` may remove.
 
     Raises:
       NotARun: what is there is not a run alone: there is no config.json, there are other files, or links.
-      OSError: a file cannot be removed.
+      OSError: it is no folder, or cannot be read.
     """
-    if not path.exists():
-        return
+    if not path.exists() and not path.is_symlink():
+        return set()
     names = {item.name for item in path.iterdir()} - {"lock"}
     links = path.is_symlink() or any(item.is_symlink() for item in path.rglob("*"))
-    if names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS} or links):
+    if links or (names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS})):
         raise NotARun
+    return names
+
+
+def link_in(path: Path) -> str | None:
+    """The name of a link in `path` that a run would write through; None where there is none."""
+    names = [*RUN_FILES, *RUN_FOLDERS, "lock", *(f"tensorboard/{item.name}" for item in path.glob("tensorboard/*"))]
+    return next((name for name in names if (path / name).is_symlink()), None)
+
+
+def remove_run(path: Path) -> None:
+    """Removes the run in `path`, if there is one, but for its lock. Raises as `run_alone`."""
+    names = run_alone(path)
     for name in names & {*RUN_FOLDERS}:
         shutil.rmtree(path / name)
     for name in names & {*RUN_FILES}:
@@ -128,6 +140,10 @@ class Records:
         if resumed_at is None and is_taken(path):
             raise RunExists
         env_steps, lengths = resumed_at or (None, {})
+        for table in ("evaluations", "metrics"):  # before one of them is cut
+            file = path / f"{table}.csv"
+            if lengths.get(table, 0) > (file.stat().st_size if file.is_file() else 0):
+                raise Shortened(file.name)
         self.path, self.members = path, members
         self.swept = [name for name in swept if name != "penalty_coef"]
         self._evaluations = _Table(

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import described
+from experiments import described, records
 from experiments.described import Described, Member
 from experiments.flags import UsageError
 
@@ -24,9 +24,12 @@ def named(path: Path, wanted: Mapping[str, Any]) -> Described:
     """
     try:
         run = described.read(path)
+        link = records.link_in(path)
     except described.NotDescribed as error:
         raise UsageError(f"--resume={path}: takes the folder of a run; {error}") from None
-    refusal = _refusal(run, wanted)
+    except OSError as error:
+        raise UsageError(f"--resume={path}: takes a folder that can be read: {error.strerror}") from None
+    refusal = f"takes a folder that holds the run itself; {link} in it is a link" if link else _refusal(run, wanted)
     if refusal:
         raise UsageError(f"--resume={path}: {refusal}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
@@ -40,7 +43,11 @@ def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:
       UsageError: there is none.
     """
     found = []
-    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+    try:
+        paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise UsageError(f"--resume: takes a folder that can be read as --out: {error}") from None
+    for path in paths:
         try:
             run = named(path, wanted)
         except UsageError:
@@ -60,7 +67,7 @@ def with_its_replay(run: Described) -> list[Member]:
 def other_versions(run: Described) -> list[str]:
     """Packages whose version is not the run's, as `jax 0.9.0 -> 0.10.2`."""
     there, here = run.content["versions"], described.versions()
-    return [f"{name} {there.get(name)} -> {here[name]}" for name in here if there.get(name) != here[name]]
+    return [f"{name} {_text(there.get(name))} -> {here[name]}" for name in here if there.get(name) != here[name]]
 
 
 def _refusal(run: Described, wanted: Mapping[str, Any]) -> str | None:
@@ -86,4 +93,5 @@ def _with_train(member: Member, **changes: Any) -> Member:
 
 
 def _text(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, Sequence) and not isinstance(value, str) else str(value)
+    text = ",".join(map(str, value)) if isinstance(value, Sequence) and not isinstance(value, str) else str(value)
+    return "".join(filter(str.isprintable, text))[:200]

@@ -80,7 +80,12 @@ def _lock(plan: "Plan", stack: ExitStack) -> None:
         flag = f"--resume={plan.path}" if plan.resumed else f"--name={plan.path.name}"
         raise flags.UsageError(f"{flag}: process {busy.process} is at work on {plan.path}; takes another run") from None
     except OSError as error:
-        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
+        raise _cannot_write(plan, error) from None
+
+
+def _cannot_write(plan: "Plan", error: OSError) -> flags.UsageError:
+    flag = f"--resume={plan.path}" if plan.resumed else f"--out={plan.options.out}"
+    return flags.UsageError(f"{flag}: takes a folder that can be written: {error}")
 
 
 def _start(plan: "Plan") -> tuple[Array, Scalars]:
@@ -94,7 +99,7 @@ def _start(plan: "Plan") -> tuple[Array, Scalars]:
 def _tables(plan: "Plan", restored: "Restored | None") -> "Records":
     """The run's tables: new ones, or those of the resumed run as they were at its checkpoint."""
     from experiments import records
-    from experiments.plan import taken
+    from experiments.plan import not_a_run, taken
 
     resumed_at = None
     if plan.resumed:
@@ -104,9 +109,7 @@ def _tables(plan: "Plan", restored: "Restored | None") -> "Records":
             records.remove_run(plan.path)
         return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at)
     except records.NotARun:
-        raise flags.UsageError(
-            f"--overwrite: {plan.path} holds other things than a run; takes a folder with a run alone"
-        ) from None
+        raise flags.UsageError(not_a_run(plan.path)) from None
     except records.RunExists:
         raise flags.UsageError(taken(plan.path)) from None
     except records.Shortened as error:
@@ -114,7 +117,7 @@ def _tables(plan: "Plan", restored: "Restored | None") -> "Records":
             f"--resume={plan.path}: {error} has lost rows since the checkpoint; takes a run with whole tables"
         ) from None
     except OSError as error:
-        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
+        raise _cannot_write(plan, error) from None
 
 
 def _describe(plan: "Plan", restored: "Restored | None", command: Sequence[str]) -> None:

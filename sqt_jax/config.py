@@ -155,21 +155,30 @@ LIMITS: dict[str, tuple[float, float, str]] = {
 }
 
 
+MAX_LAYERS = 32
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 100 else f"{text[:100]}..."
+
+
 def check_value(setting: str, value: Any) -> None:
     """Raises ConfigError where `value` alone, whatever the other settings are, cannot be."""
     if setting in CHOICES and value not in CHOICES[setting]:
         raise ConfigError(setting, f"takes one of {', '.join(CHOICES[setting])}, not {value!r}")
     if setting in LIMITS:
         low, high, takes = LIMITS[setting]
-        kinds = (int,) if "whole" in takes else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high or math.isinf(value):
+        # Whole numbers are int32 on the device, the others float32.
+        kinds, largest = ((int,), 2**31 - 1) if "whole" in takes else ((int, float), 3.4e38)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= min(high, largest):
             raise ConfigError(setting, f"takes {takes}, not {value!r}")
     if setting in SWITCHES and not isinstance(value, bool):
         raise ConfigError(setting, f"takes true or false, not {value!r}")
     if setting == "hidden" and not (
-        isinstance(value, (tuple, list)) and value and all(type(w) is int and 1 <= w <= 65536 for w in value)
+        isinstance(value, (tuple, list)) and 1 <= len(value) <= MAX_LAYERS and all(type(w) is int and 1 <= w <= 65536 for w in value)
     ):
-        raise ConfigError(setting, f"takes layer widths, whole numbers from 1 to 65536 as in 256,256, not {value!r}")
+        raise ConfigError(setting, f"takes layer widths, whole numbers from 1 to 65536 as in 256,256, not {_brief(value)}")
 
 
 def _refuse(wrong: bool, setting: str, message: str) -> None:
