@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,7 @@ def define_flags() -> absl_flags.FlagValues:
     return values
 
 
-def parse(argv: Sequence[str]) -> absl_flags.FlagValues:
+def parse(argv: Sequence[str]) -> dict[str, Any]:
     """The command line, checked; `coefs` as numbers.
 
     Raises:
@@ -84,33 +85,34 @@ def parse(argv: Sequence[str]) -> absl_flags.FlagValues:
         found = re.search(r"-*(\w+)(?==|$)", str(error).removeprefix("flag ").splitlines()[0])
         if not found or found[1] not in values:
             raise UsageError(str(error).splitlines()[0]) from None
-        flag = values[found[1]]
-        takes = flag.parser.syntactic_help or ("true or false" if flag.boolean else "a word")
+        wrong = values[found[1]]
+        takes = wrong.parser.syntactic_help or ("true or false" if wrong.boolean else "a word")
         raise UsageError(f"--{found[1]}: takes {takes}") from None
     if rest:
         raise UsageError(f"{rest[0]}: unexpected argument; settings are given as --flag=value")
+    flag: dict[str, Any] = {name: values[name].value for name in values}
     for name, known in (("mdps", mdps.MDPS), ("algos", tabular_agents.algorithms())):
-        _check_list(name, values[name].value)
-        for word in values[name].value:
+        _check_list(name, flag[name])
+        for word in flag[name]:
             if word not in known:
                 raise UsageError(f"--{name}: {unknown(word, known)}")
-    if values["greedy"].value not in tabular_agents.GREEDY:
-        raise UsageError(f"--greedy: {unknown(values['greedy'].value, tabular_agents.GREEDY)}")
-    _check_list("coefs", values["coefs"].value)
-    coefs = [_coefficient(word) for word in values["coefs"].value]
+    if flag["greedy"] not in tabular_agents.GREEDY:
+        raise UsageError(f"--greedy: {unknown(flag['greedy'], tabular_agents.GREEDY)}")
+    _check_list("coefs", flag["coefs"])
+    coefs = [_coefficient(word) for word in flag["coefs"]]
     _check_list("coefs", coefs)
-    values["coefs"].value = coefs
+    flag["coefs"] = coefs
     for name in ("gamma", "lr_power", "epsilon", "init_std", "weighted_c"):
-        if not math.isfinite(values[name].value):
-            raise UsageError(f"--{name}: takes a number, not {values[name].value}")
-    if values["gamma"].value >= 1:
-        raise UsageError(f"--gamma: takes a number from 0 to below 1, not {values['gamma'].value:g}")
-    if values["lr_power"].value <= 0.5:
-        raise UsageError(f"--lr_power: takes a number above 0.5 and up to 1, not {values['lr_power'].value:g}")
-    if values["weighted_c"].value == 0:
+        if not math.isfinite(flag[name]):
+            raise UsageError(f"--{name}: takes a number, not {flag[name]}")
+    if flag["gamma"] >= 1:
+        raise UsageError(f"--gamma: takes a number from 0 to below 1, not {flag['gamma']:g}")
+    if flag["lr_power"] <= 0.5:
+        raise UsageError(f"--lr_power: takes a number above 0.5 and up to 1, not {flag['lr_power']:g}")
+    if flag["weighted_c"] == 0:
         raise UsageError("--weighted_c: takes a number above 0, not 0")
-    _check_out(values["out"].value, values["overwrite"].value)
-    return values
+    _check_out(flag["out"], flag["overwrite"])
+    return flag
 
 
 def _check_list(name: str, words: Sequence) -> None:
@@ -156,9 +158,8 @@ def models(name: str, seeds: int, gamma: float) -> tabular_agents.Model:
     return tabular_agents.model_of(mdps.stack(found), np.stack([mdps.optimal_q(mdp, gamma) for mdp in found]))
 
 
-def run(values: absl_flags.FlagValues) -> Iterator[tuple[report.Names, report.Curves, float]]:
+def run(flag: dict[str, Any]) -> Iterator[tuple[report.Names, report.Curves, float]]:
     """The algorithms on the MDPs one after the other, and the share of the work that is done."""
-    flag = values.flag_values_dict()
     table = tabular_agents.algorithms(flag["tables"], flag["ddof"], flag["greedy"], flag["weighted_c"])
     steps = checkpoints(flag["steps"])
     lengths = jnp.asarray(np.diff(steps, prepend=0), jnp.int32)
@@ -181,7 +182,7 @@ def run(values: absl_flags.FlagValues) -> Iterator[tuple[report.Names, report.Cu
             yield (mdp, algo), curves, done / total
 
 
-def settings_of(flag: dict) -> list[str]:
+def settings_of(flag: dict[str, Any]) -> list[str]:
     epsilon = flag["epsilon"]
     return [
         f"{flag['seeds']} seeds, {flag['steps']:,} steps, gamma {flag['gamma']:g}; behaviour "
@@ -194,7 +195,7 @@ def settings_of(flag: dict) -> list[str]:
 
 
 def statements(
-    flag: dict, results: dict[report.Names, report.Curves], expansions: Sequence[report.Expansion]
+    flag: dict[str, Any], results: dict[report.Names, report.Curves], expansions: Sequence[report.Expansion]
 ) -> list[report.Statement]:
     return [
         report.overestimation(results),
@@ -212,7 +213,7 @@ def terminal_table(lines: Sequence[Sequence[str]], left: int) -> Table:
     """The first line is the header; the first `left` columns hold words, and a new first word begins a section."""
     shown = Table(box=SIMPLE_HEAD)
     for index, name in enumerate(lines[0]):
-        shown.add_column(name, justify="left" if index < left else "right")
+        shown.add_column(name.replace(" ", "\n"), justify="left" if index < left else "right", no_wrap=True)
     before = lines[1][0] if len(lines) > 1 else ""
     for row in lines[1:]:
         if left and row[0] != before:
@@ -236,13 +237,13 @@ def main(argv: Sequence[str]) -> int:
         print(__doc__ + "\n" + define_flags().get_help())
         return DONE
     try:
-        values = parse(argv)
-        out = Path(values["out"].value)
+        flag = parse(argv)
+        out = Path(flag["out"])
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"--out={out}: takes a folder that can be made: {error.strerror}") from None
-        return measure(values, out, argv)
+        return measure(flag, out, argv)
     except UsageError as error:
         print("".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error)), file=sys.stderr)
         return BAD_USAGE
@@ -250,14 +251,14 @@ def main(argv: Sequence[str]) -> int:
         return INTERRUPTED
 
 
-def measure(values: absl_flags.FlagValues, out: Path, argv: Sequence[str]) -> int:
+def measure(flag: dict[str, Any], out: Path, argv: Sequence[str]) -> int:
     runtime.prepare()
     console, began = Console(), time.monotonic()
     if not console.is_terminal:
         console.width = 132
     results: dict[report.Names, report.Curves] = {}
     with console.status("compiling") as status:
-        for names, curves, share in run(values):
+        for names, curves, share in run(flag):
             results[names] = curves
             passed = time.monotonic() - began
             line = f"{', '.join(names)}: {share:.0%} after {format_seconds(passed)}"
@@ -266,7 +267,6 @@ def measure(values: absl_flags.FlagValues, out: Path, argv: Sequence[str]) -> in
                 status.update(line)
             else:
                 console.print(line, highlight=False)
-    flag = values.flag_values_dict()
     sqt = tabular_agents.algorithms(flag["tables"], flag["ddof"], flag["greedy"])["sqt"]
     expansions = report.expansions(sqt, flag["coefs"], flag["ddof"], contraction.PAIRS)
     table, expansion = report.cells(results), report.expansion_table(expansions)
