@@ -189,7 +189,9 @@ def settings_of(flag: dict[str, Any]) -> list[str]:
         + ("uniform" if epsilon == 1 else f"epsilon-greedy, epsilon {epsilon:g}"),
         f"step size 1 / n(s, a)^{flag['lr_power']:g}, n the visits from which the table has learned",
         f"MaxMin and SQT: {flag['tables']} tables, ddof {flag['ddof']}, a' greedy by the {flag['greedy']}; weighted "
-        f"Double Q: c {flag['weighted_c']:g}; initial values N(0, {flag['init_std']:g}^2)",
+        f"Double Q: c {flag['weighted_c']:g}; initial values "
+        + (f"N(0, {flag['init_std']:g}^2)" if flag["init_std"] else "0"),
+        "T: the expected target of eq. 13 as experiments/tabular_agents.py states it; the paper itself was not at hand",
         *(mdps.ABOUT[name] for name in flag["mdps"]),
     ]
 

@@ -66,7 +66,7 @@ def collapsed(curves: Curves) -> bool:
 
 def along(curves: Curves, index: int) -> np.ndarray:
     """The bias on the way: its mean over the checkpoints, which lie evenly in the logarithm of the steps. [seeds]"""
-    return curves.record.bias[:, index].mean(axis=-1)
+    return np.asarray(curves.record.bias)[:, index].mean(axis=-1)
 
 
 def _coef(value: float | None) -> str:
@@ -106,7 +106,7 @@ def cells(results: Mapping[Names, Curves]) -> list[tuple[str, ...]]:
                 f"{record.error_max[:, k, -1].mean():.3f}",
                 f"{record.error_mean[:, k, -1].mean():.3f}",
                 _signed(*interval(along(curves, k))),
-                _signed(*interval(record.bias[:, k, -1])),
+                _signed(*interval(np.asarray(record.bias)[:, k, -1])),
                 f"{record.std[:, k, early].mean():.3f}" if several else "-",
                 f"{record.std[:, k, -1].mean():.3f}" if several else "-",
                 f"{record.ratio[:, k].max():.3f}",
