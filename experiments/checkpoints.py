@@ -155,7 +155,7 @@ class Checkpoints:
         rows = _reaching(self._rows, env_steps, capacity)
         part = self.path / f"{_step_name(env_steps)}.part"
         try:
-            shutil.rmtree(part, ignore_errors=True)
+            _remove(part)
             _orbax().save(part.absolute() / "state", arrays)
             written = files.below(part / "state")
             state = {name: [path.stat().st_size, files.crc(path)] for name, path in written.items()}
@@ -186,7 +186,7 @@ class Checkpoints:
         for item in self.path.iterdir():
             if item.name in wanted or not re.fullmatch(rf"({STEP.pattern}|{ROWS.pattern})(\.part)?", item.name):
                 continue
-            shutil.rmtree(item, ignore_errors=True) if item.is_dir() else item.unlink(missing_ok=True)
+            _remove(item)
 
     # Reading.
 
@@ -199,8 +199,12 @@ class Checkpoints:
     def _verify(self, env_steps: int, template: TrainState) -> tuple[list[Rows], Position, dict[str, int]]:
         """Reads every byte of a checkpoint once, before anything is made of it."""
         folder = self.path / _step_name(env_steps)
+        if folder.is_symlink():
+            raise Unusable("it is a link")
         try:
             manifest = files.read_json(folder / "manifest.json", MAX_MANIFEST_BYTES)
+            if manifest["format"] != FORMAT:
+                raise Unusable(f"its format is {str(manifest['format'])[:20]!r}, not {FORMAT}")
             names, crcs = manifest["rows"], manifest["crc"]
             rows = [
                 Rows(int(match[1]), int(match[2]), int(crc))
@@ -209,11 +213,11 @@ class Checkpoints:
             ]
             position = _position(manifest["position"], env_steps)
             lengths = {str(name): int(length) for name, length in manifest["lengths"].items()}
+            if min(lengths.values(), default=0) < 0:
+                raise ValueError
             expected = {str(name): (int(size), int(crc)) for name, (size, crc) in manifest["state"].items()}
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
             raise Unusable(f"its manifest.json cannot be read ({type(error).__name__})") from None
-        if manifest.get("format") != FORMAT:
-            raise Unusable(f"its format is {manifest.get('format')!r}, not {FORMAT}")
         found = files.below(folder / "state")
         if expected.keys() != found.keys():
             raise Unusable("files are missing or are there too many")
@@ -276,6 +280,13 @@ def _position(values: dict[str, Any], env_steps: int) -> Position:
     if position.env_steps != env_steps or not -1 <= position.evaluated <= env_steps or position.wall_seconds < 0:
         raise ValueError
     return position
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _step_name(env_steps: int) -> str:

@@ -106,7 +106,7 @@ def read(path: Path) -> Described:
     except OSError as error:
         raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None
     except ConfigError as error:
-        raise NotDescribed(f"its {NAME} names a setting that cannot be: {error}") from None
+        raise NotDescribed(f"its {NAME} names a setting that cannot be: {str(error)[:300]}") from None
     except NotDescribed:
         raise
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:

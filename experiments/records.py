@@ -16,6 +16,7 @@ from tensorboardX import SummaryWriter
 from experiments import files
 from experiments.described import Member
 from experiments.loop import Outcome, Report
+from sqt_jax import bias
 
 # The columns that every evaluations.csv has; further swept scalars follow.
 EVALUATION_COLUMNS = (
@@ -90,10 +91,12 @@ def run_alone(path: Path) -> set[str]:
       NotARun: what is there is not a run alone: there is no config.json, there are other files, or links.
       OSError: it is no folder, or cannot be read.
     """
-    if not path.exists() and not path.is_symlink():
+    if path.is_symlink():
+        raise NotARun
+    if not path.exists():
         return set()
     names = {item.name for item in path.iterdir()} - {"lock"}
-    links = path.is_symlink() or any(item.is_symlink() for item in path.rglob("*"))
+    links = any(item.is_symlink() for item in path.rglob("*"))
     if links or (names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS})):
         raise NotARun
     return names
@@ -183,10 +186,12 @@ class Records:
         """A row per member in evaluations.csv where there was an evaluation, in metrics.csv where there were steps."""
         if report.metrics and self._metrics is None:
             columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *report.metrics]
+            columns += bias.NAMES
             # SAC's temperature is a metric too, and says the same where it is swept.
             self._metrics = _Table(self.path / "metrics.csv", 0, [*dict.fromkeys(columns), "wall_seconds"])
         for index, member in enumerate(self.members):
             metrics = {name: float(values[index]) for name, values in report.metrics.items()}
+            judged = {name: float(values[index]) for name, values in report.bias.items()}
             row: dict[str, Any] = {
                 "member": index,
                 "env_steps": report.env_steps,
@@ -204,9 +209,10 @@ class Records:
                     "episode_length_mean": float(report.lengths[index].mean()),
                 }
                 measured = {name: metrics.get(name, math.nan) for name in ("q_mean", "q_std")}
+                evaluation["value_bias"] = judged.get("value_bias", math.nan)
                 self._evaluations.write(row | evaluation | measured)
             if self._metrics and report.metrics:
-                self._metrics.write(row | metrics)
+                self._metrics.write(row | metrics | judged)
             if self._events:
                 values = {f"eval/{name}": value for name, value in evaluation.items()}
                 values |= {f"train/{name}": value for name, value in metrics.items()}

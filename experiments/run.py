@@ -19,7 +19,7 @@ from rich.console import Console
 
 from experiments import flags, progress, runtime
 from experiments.loop import BEGINNING, Outcome, Position, train_loop
-from sqt_jax.algorithms import make_trainer, replay_of
+from sqt_jax.algorithms import agent_of, make_trainer, replay_of
 from sqt_jax.policy import save_policy
 from sqt_jax.train import Sweep, TrainState, evaluation_steps, make_sweep
 from sqt_jax.types import Array, Environment, Scalars
@@ -146,8 +146,10 @@ def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes
         say(f"going on with it {at}")
         if others := resume.other_versions(plan.resumed):
             say(f"other versions than when it began, so that it may go on differently: {', '.join(others)}")
+    # The policy whose values are judged is played beside the deterministic one, where it is another.
+    episodes = train.eval_episodes * (2 if agent_of(plan.config, plan.env).valued_act else 1)
     evaluations = len(evaluation_steps(train))
-    say(progress.evaluation_share(train.steps, evaluations, train.eval_episodes, plan.env.episode_length))
+    say(progress.evaluation_share(train.steps, evaluations, episodes, plan.env.episode_length))
     if every := plan.output["checkpoint_every"]:
         state, row = sizes
         say(

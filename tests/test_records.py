@@ -27,12 +27,13 @@ def members_of(*, seeds=(3, 5), **swept):
     return make_members(seeds, [make_config("sac_sqt", "ant", **{name: value}) for value in values])
 
 
-def report(env_steps, returns, metrics=None):
+def report(env_steps, returns, metrics=None, **bias):
     """A report of as many members as `returns` has rows."""
     returns = np.array(returns, np.float32) if returns is not None else None
     metrics = {name: np.array(values) for name, values in (metrics or {}).items()}
     lengths = np.full(returns.shape, 100) if returns is not None else None
-    return Report(env_steps, env_steps // 2, env_steps / 8, metrics, returns, lengths)
+    bias = {name: np.array(values) for name, values in bias.items()}
+    return Report(env_steps, env_steps // 2, env_steps / 8, metrics, returns, lengths, bias)
 
 
 def outcome(**changes):
@@ -75,7 +76,7 @@ def test_evaluations_have_exactly_the_agreed_columns(tmp_path):
     with Records(tmp_path / "run", members_of(), ["penalty_coef"], tensorboard=False) as records:
         records.report(report(0, [[1, 3], [5, 5]]))
         metrics = {"q_std": [0.25, 0.5], "q_mean": [1.0, 2.0], "loss": [np.nan, 1.0]}
-        records.report(report(20, [[2, 4], [6, 8]], metrics))
+        records.report(report(20, [[2, 4], [6, 8]], metrics, value_bias=[-1.5, np.nan], value_bias_min=[-2.0, -3.0]))
         # Rows are on disk at once: the files are still open here.
         text = (tmp_path / "run" / "evaluations.csv").read_text()
     assert text == (
@@ -83,13 +84,14 @@ def test_evaluations_have_exactly_the_agreed_columns(tmp_path):
         "q_mean,q_std,value_bias,wall_seconds\n"
         "0,0,0,3,0.5,2.0,1.0,100.0,,,,0.0\n"
         "1,0,0,5,0.5,5.0,0.0,100.0,,,,0.0\n"
-        "0,20,10,3,0.5,3.0,1.0,100.0,1.0,0.25,,2.5\n"
+        "0,20,10,3,0.5,3.0,1.0,100.0,1.0,0.25,-1.5,2.5\n"
         "1,20,10,5,0.5,7.0,1.0,100.0,2.0,0.5,,2.5\n"
     )
     assert (tmp_path / "run" / "metrics.csv").read_text() == (
-        "member,env_steps,gradient_steps,seed,penalty_coef,q_std,q_mean,loss,wall_seconds\n"
-        "0,20,10,3,0.5,0.25,1.0,,2.5\n"
-        "1,20,10,5,0.5,0.5,2.0,1.0,2.5\n"
+        "member,env_steps,gradient_steps,seed,penalty_coef,q_std,q_mean,loss,"
+        "value_bias,value_bias_min,value_bias_normalised,wall_seconds\n"
+        "0,20,10,3,0.5,0.25,1.0,,-1.5,-2.0,,2.5\n"
+        "1,20,10,5,0.5,0.5,2.0,1.0,,-3.0,,2.5\n"
     )
 
 
@@ -100,7 +102,8 @@ def test_other_swept_scalars_are_further_columns(tmp_path):
     assert tuple(rows[0]) == (*EVALUATION_COLUMNS, "temperature")
     assert [row["temperature"] for row in rows] == ["0.1", "0.1", "0.2", "0.2"]
     header = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[0].split(",")
-    assert header == ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", "temperature", "wall_seconds"]
+    assert header[:6] == ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", "temperature"]
+    assert header.count("temperature") == 1 and header[-1] == "wall_seconds"
 
 
 def test_an_interval_without_an_evaluation_is_a_row_of_metrics_alone(tmp_path):
