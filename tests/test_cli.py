@@ -179,6 +179,13 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
     late = [row for row in rows if row["env_steps"] != "0"]
     assert {row["member"] for row in late if row["return_mean"]} == {"0", "1"}
     assert [group["final"]["mean"] is None for group in summary["groups"]] == [False, True]
+    # The others do not notice: their rows are those of a run in which nobody diverges.
+    assert run(tmp_path / "good", "--temperature=0.2,0.3") == 0
+    for name in ("evaluations.csv", "metrics.csv"):
+        with_it, without = (rows_of(out / "ant" / "sac_sqt" / "run" / name) for out in (tmp_path, tmp_path / "good"))
+        for ours, theirs in zip(with_it, without, strict=True):
+            del ours["wall_seconds"], theirs["wall_seconds"]
+            assert (ours == theirs) == (ours["member"] in ("0", "1"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
