@@ -60,7 +60,11 @@ def listing(store):
     return sorted(path.name for path in store.path.iterdir())
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize(
+    # MaxMin and REDQ are TD3 and SAC of other sizes.
+    "algo",
+    [pytest.param(a, marks=[pytest.mark.slow] if a.startswith(("maxmin", "redq")) else []) for a in ALGORITHMS],
+)
 def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)

@@ -41,14 +41,17 @@ def test_a_grid_is_trained_once(tmp_path):
 
     def one(cell):
         trained.append((cell.task, cell.algo))
-        return train(cell)
+        cell.path.mkdir(parents=True)
+        summary = {"status": "done", "diverged": [], "groups": [{"score": {"mean": 5.0, "std": 0.0}}]}
+        (cell.path / "summary.json").write_text(json.dumps(summary))
+        return 0
 
     assert sweep(grid[:3], one, lines.append) == 0
     assert sweep(grid, one, lines.append) == 0
     assert trained == [("ant", "td3"), ("ant", "td3_sqt"), ("walker", "td3"), ("walker", "td3_sqt")]
     assert lines[0] == "3 runs, 0 of them finished" and lines[4] == "4 runs, 3 of them finished"
     assert lines[1].startswith("1/3 td3 on ant: score 5 +- 0 in ") and lines[3].endswith("; 0:00 left")
-    assert all(finished(cell)["env_steps"] == 60 for cell in grid)
+    assert all(finished(cell) for cell in grid)
 
 
 def test_what_was_interrupted_is_gone_on_with(tmp_path, monkeypatch):
@@ -75,10 +78,10 @@ def test_a_cell_that_cannot_be_trained_ends_the_sweep(tmp_path):
 
 
 def test_a_diverged_member_does_not(tmp_path):
-    grid = cells(Preset(("td3_sqt",), ("ant", "walker")), (), (), tmp_path, [*TINY.split(), "--penalty_coef=1e38"])
+    grid = cells(Preset(("td3_sqt",), ("ant",)), (), (), tmp_path, [*TINY.split(), "--penalty_coef=1e38"])
     lines = []
     assert sweep(grid, train, lines.append) == 3
-    assert lines[-1].startswith("2/2 td3_sqt on walker: score") and "(2 diverged)" in lines[-1]
+    assert lines[-1].startswith("1/1 td3_sqt on ant: score") and "(2 diverged)" in lines[-1]
     assert sweep(grid, lambda cell: pytest.fail("it has ended"), lines.append) == 0
 
 
