@@ -119,11 +119,14 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
-def resumed(content: dict[str, Any], steps: int, env_steps: int, command: Sequence[str]) -> dict[str, Any]:
+def resumed(
+    content: dict[str, Any], steps: int, output: Mapping[str, Any], env_steps: int, command: Sequence[str]
+) -> dict[str, Any]:
     """config.json of a run that is gone on with at `env_steps`, to `steps`."""
     entry = {"env_steps": env_steps, "at": _now(), "command": list(command)}
     entry |= {"commit": _commit(), "versions": versions()}
-    return content | {"settings": content["settings"] | {"steps": steps}, "resumed": [*content["resumed"], entry]}
+    settings = content["settings"] | {"steps": steps}
+    return content | {"settings": settings, "output": dict(output), "resumed": [*content["resumed"], entry]}
 
 
 def versions() -> dict[str, str | None]:

@@ -173,6 +173,8 @@ def train_loop(
 
     evaluations = {step for step in evaluation_steps(train) if step > evaluated}
     checkpoints = set(checkpoint_steps(checkpoint_every, done, train.steps))
+    if checkpoint_every and evaluations:  # also where the last one alone is left
+        checkpoints.add(train.steps)
     for point in sorted(evaluations | checkpoints):
         while done < point and not stop():
             learn = done >= train.warmup_steps

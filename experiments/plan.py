@@ -45,7 +45,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
 
     Raises `flags.UsageError` for settings that cannot be, a directory that is taken and too little memory.
     """
-    members, swept, path, run = _resumed(options) if options.resume else _named(options)
+    members, swept, path, run = _named(options) if options.resume in (None, flags.LATEST) else _resumed(options)
     if run is None:
         try:
             if options.overwrite:

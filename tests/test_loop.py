@@ -194,6 +194,13 @@ def test_a_run_goes_on_where_it_stood(at, evaluated, left):
     assert all(np.isnan(report.returns[1]).all() for report in recorder.reports)
 
 
+def test_where_only_the_last_evaluation_is_left_a_checkpoint_follows_it():
+    recorder = Recorder(TRAIN)
+    recorder.run(start=Position(2_000, 1_500), checkpoint_every=250)
+    assert recorder.calls == [] and [report.env_steps for report in recorder.reports] == [2_000]
+    assert [(at.env_steps, at.evaluated) for at in recorder.saved] == [(2_000, 2_000)]
+
+
 def test_a_run_that_is_done_stays_as_it_is():
     recorder = Recorder(TRAIN)
     outcome = recorder.run(start=Position(2_000, 2_000, (), 5.0), checkpoint_every=250)
