@@ -36,7 +36,7 @@ FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
 flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
-flags.DEFINE_list("physics", list(envs.PHYSICS), "Physics of the suites env and loop.")
+flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itself all that can run here.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
@@ -49,7 +49,7 @@ def check_flags() -> None:
     """Leaves with one line that names the first flag with a value that cannot be."""
     known = {"suites": SUITES, "tasks": envs.TASKS, "algos": algorithms.ALGORITHMS, "physics": envs.PHYSICS}
     for name, values in known.items():
-        for value in getattr(FLAGS, name):
+        for value in getattr(FLAGS, name) or ():
             if value not in values:
                 sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
     for name in ("members", "capacities"):
@@ -58,8 +58,16 @@ def check_flags() -> None:
                 sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
 
 
-def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
-    tasks, algos, physics = FLAGS.tasks, FLAGS.algos, FLAGS.physics
+def physics_here() -> list[str]:
+    """--physics; leaves with one line where the machine lacks what one of them needs."""
+    for name in FLAGS.physics or ():
+        if missing := envs.lacks(name):
+            sys.exit(f"--physics: {name} needs {missing}")
+    return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
+
+
+def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterator[Row]:
+    tasks, algos = FLAGS.tasks, FLAGS.algos
     members = [int(value) for value in FLAGS.members]
     for suite in suites:
         for count in members:
@@ -121,7 +129,7 @@ def main(argv: Sequence[str]) -> None:
     console = Console()
     console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
     found = []
-    for row in rows(FLAGS.suites, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
+    for row in rows(FLAGS.suites, physics_here(), seconds=FLAGS.seconds, repeats=FLAGS.repeats):
         found.append(row)
         console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
     table = Table("suite", "what", "members", "rate", "unit", "compile s", title="median of repeats")

@@ -16,7 +16,7 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments import runtime
-from experiments.bench import check_flags, machine
+from experiments.bench import check_flags, machine, physics_here
 from experiments.gymnasium_reference import Episode, episode, recorded
 from experiments.measure import bench_env
 from sqt_jax import envs
@@ -159,10 +159,11 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
+    simulators = physics_here()
     episodes: dict[str, WholeEpisodes] = {}
     steps: dict[tuple[str, str], tuple[Steps, float]] = {}
     for name in FLAGS.tasks:
-        for physics in FLAGS.physics:
+        for physics in simulators:
             print(f"{name} on {physics} ...", file=sys.stderr, flush=True)
             env = envs.make(name, physics)
             if physics == "mujoco":

@@ -24,7 +24,7 @@ from experiments import flags, progress, runtime
 from experiments.loop import train_loop
 from experiments.presets import preset_settings
 from sqt_jax import envs
-from sqt_jax.algorithms import make_config, make_trainer, memory_estimate
+from sqt_jax.algorithms import check_physics, make_config, make_trainer, memory_estimate
 from sqt_jax.config import ConfigError
 from sqt_jax.policy import save_policy
 from sqt_jax.train import evaluation_steps, make_sweep
@@ -65,6 +65,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
             make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
+        check_physics(configs[0])
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
         raise flags.UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None

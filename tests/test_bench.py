@@ -7,6 +7,7 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench
+from sqt_jax.envs import physics
 
 
 def test_ratios_are_those_of_one_task_and_number_of_members():
@@ -22,7 +23,7 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
     found = [
         bench.Row("env", task, members, "env steps", 1234.5, 6.78) for task in ("ant", "walker") for members in (1, 5)
     ]
-    monkeypatch.setattr(bench, "rows", lambda suites, **timing: found)
+    monkeypatch.setattr(bench, "rows", lambda suites, physics, **timing: found)
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
     cached = jax.config.jax_enable_compilation_cache
     try:
@@ -54,3 +55,11 @@ def test_a_wrong_name_is_told_in_one_line_before_anything_runs(flag, value):
         bench.main(["bench"])
     message = str(error.value)
     assert message.startswith(f"--{flag}: takes ") and value in message and "\n" not in message
+
+
+def test_physics_that_cannot_run_here_are_left_out_or_refused(monkeypatch):
+    monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
+    bench.FLAGS.mark_as_parsed()
+    assert bench.physics_here() == ["mjx", "mujoco"]
+    with flagsaver.flagsaver(physics=["warp"]), pytest.raises(SystemExit, match="^--physics: warp needs a part$"):
+        bench.physics_here()

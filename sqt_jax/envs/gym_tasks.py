@@ -83,7 +83,7 @@ def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:
     """The environment of the row `name` in `TASKS`, on the named simulator with its options.
 
     Raises:
-      ValueError: the simulator is unknown.
+      ValueError: the simulator is unknown, or cannot run here.
       TypeError: it has no such option.
     """
     task = TASKS[name]
