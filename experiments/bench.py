@@ -37,6 +37,7 @@ flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
 flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
 flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itself all that can run here.")
+flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
@@ -56,6 +57,18 @@ def check_flags() -> None:
         for value in getattr(FLAGS, name):
             if not value.isdecimal() or int(value) < 1:
                 sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
+    solver_limits()
+
+
+def solver_limits() -> dict[str, dict[str, int]]:
+    """--solver: each of its values -> MJX's options; leaves with one line where one cannot be."""
+    found = {}
+    for value in FLAGS.solver:
+        numbers = value.split("/")
+        if len(numbers) != 2 or not all(number.isdecimal() and int(number) for number in numbers):
+            sys.exit(f"--solver: takes pairs of whole numbers of at least 1 as in 8/8, not {value!r}")
+        found[value] = dict(zip(("iterations", "ls_iterations"), map(int, numbers), strict=True))
+    return found
 
 
 def physics_here() -> list[str]:
@@ -75,7 +88,7 @@ def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterat
                 yield from (bench_env(task, count, name, **timing) for task in tasks for name in physics)
             elif suite == "physics":
                 for task in tasks:
-                    yield from bench_physics(task, count, **timing)
+                    yield from bench_physics(task, count, solver_limits(), **timing)
             elif suite == "update":
                 yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
             elif suite == "replay":

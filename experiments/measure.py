@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -135,11 +135,12 @@ def bare_steps(task: str, members: int) -> Callable[[int], None]:
     return run
 
 
-def bench_physics(task: str, members: int, **timing: Any) -> Iterator[Row]:
-    """One task on each physics, beside MuJoCo alone and MJX with the model file's solver settings."""
+def bench_physics(task: str, members: int, solver: Mapping[str, dict[str, int]], **timing: Any) -> Iterator[Row]:
+    """One task on each physics, beside MuJoCo alone and MJX with the model file's and with other solver settings."""
     runs = {"MuJoCo alone": bare_steps(task, members)}
     runs |= {name: env_steps(task, members, name) for name in envs.PHYSICS if not envs.lacks(name)}
     runs["mjx, the file's iterations"] = env_steps(task, members, "mjx", iterations=None, ls_iterations=None)
+    runs |= {f"mjx {limits}": env_steps(task, members, "mjx", **options) for limits, options in solver.items()}
     rates = measure_in_turns(list(runs.values()), **timing)
     for what, (rate, compile_seconds) in zip(runs, rates, strict=True):
         yield Row("physics", f"{task}, {what}", members, "env steps", rate * members, compile_seconds)

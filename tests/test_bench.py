@@ -45,6 +45,8 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
         ("tasks", "hopper2"),
         ("algos", "td8"),
         ("physics", "x"),
+        ("solver", "8"),
+        ("solver", "8/0"),
         ("members", "0"),
         ("capacities", "x"),
     ],
@@ -63,3 +65,11 @@ def test_physics_that_cannot_run_here_are_left_out_or_refused(monkeypatch):
     assert bench.physics_here() == ["mjx", "mujoco"]
     with flagsaver.flagsaver(physics=["warp"]), pytest.raises(SystemExit, match="^--physics: warp needs a part$"):
         bench.physics_here()
+
+
+def test_limits_of_the_solver_are_pairs():
+    bench.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(solver=["100/50", "8/3"]):
+        first, second = bench.solver_limits().items()
+    assert first == ("100/50", {"iterations": 100, "ls_iterations": 50})
+    assert second == ("8/3", {"iterations": 8, "ls_iterations": 3})

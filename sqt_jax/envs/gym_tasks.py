@@ -88,6 +88,7 @@ def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:
     """
     task = TASKS[name]
     model = load_model(task)
+    options = {**task.options.get(physics, {}), **options}
     simulator: Physics = make_physics(physics, Setup(model, task.frame_skip, task.quantities, task.tracked), **options)
     low, high = model.actuator_ctrlrange.T.astype(np.float32)
     control_step = model.opt.timestep * task.frame_skip

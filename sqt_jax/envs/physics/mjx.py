@@ -32,7 +32,7 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
 
     Args:
       iterations: most steps of the constraint solver; None takes the model file's. A control step with 8 is as near to
-        MuJoCo's as one with 100.
+        MuJoCo's as one with 100; some tasks need fewer (`Task.options`).
       ls_iterations: most steps of its line search, which under `vmap` all cost time; None takes the model file's.
 
     Raises:
