@@ -24,7 +24,7 @@ from experiments.measure import (
     REPLAYS,
     Row,
     bench_env,
-    bench_loop,
+    bench_loops,
     bench_physics,
     bench_replay,
     bench_update,
@@ -99,8 +99,8 @@ def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterat
                     for size in FLAGS.capacities
                 )
             elif suite == "loop":
-                cases = itertools.product(algos, tasks, physics)
-                yield from (bench_loop(algo, task, count, name, **timing) for algo, task, name in cases)
+                for algo, task in itertools.product(algos, tasks):
+                    yield from bench_loops(algo, task, count, physics, **timing)
 
 
 def machine() -> dict[str, Any]:
@@ -114,15 +114,23 @@ def machine() -> dict[str, Any]:
     return {"cpu": cpu, "device": f"{device.platform}: {device.device_kind}", "jax": jax.__version__}
 
 
+# Of the suites physics and loop: what is measured against what.
+AGAINST = {
+    ("physics", "mujoco"): "MuJoCo alone",
+    ("physics", "mjx"): "mjx, the file's iterations",
+    ("loop", "mujoco"): "mjx",
+}
+
+
 def ratios(all_rows: Sequence[Row]) -> list[str]:
-    """What the suite physics is for: each physics against MuJoCo alone, and MJX against the file's settings."""
-    rates = {(r.what, r.members): r.rate for r in all_rows if r.suite == "physics"}
+    """What these suites are for: each physics against MuJoCo alone, MJX against the file's settings, whole loops."""
+    rates = {(r.suite, r.what, r.members): r.rate for r in all_rows}
     lines = []
-    for (what, members), rate in rates.items():
+    for (suite, what, members), rate in rates.items():
         task, _, physics = what.partition(", ")
-        for reference in {"mujoco": "MuJoCo alone", "mjx": "mjx, the file's iterations"}.get(physics, "").splitlines():
-            ratio = rate / rates[f"{task}, {reference}", members]
-            lines.append(f"{task}, {members} members: {physics} / {reference} = {ratio:.2f}")
+        reference = AGAINST.get((suite, physics), "")
+        if other := rates.get((suite, f"{task}, {reference}", members)):
+            lines.append(f"{task}, {members} members: {physics} / {reference} = {rate / other:.2f}")
     return lines
 
 

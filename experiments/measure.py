@@ -222,8 +222,16 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
     return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
 
 
-def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) -> Row:
-    """The whole training loop: environment step, insert, sample, update."""
+def bench_loops(algo: str, task: str, members: int, physics: Sequence[str], **timing: Any) -> Iterator[Row]:
+    """The whole training loop, on each physics in turn: environment step, insert, sample, update."""
+    runs, compile_seconds = zip(*(loop_steps(algo, task, members, name) for name in physics), strict=True)
+    rates = measure_in_turns(runs, **timing)
+    for name, (rate, _), seconds in zip(physics, rates, compile_seconds, strict=True):
+        yield Row("loop", f"{algo} on {task}, {name}", members, "env steps", rate * members, seconds)
+
+
+def loop_steps(algo: str, task: str, members: int, physics: str) -> tuple[Callable[[int], Any], float]:
+    """A number of lockstep steps of training -> what it waits for; and the seconds of compilation."""
     config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
     sweep = train.make_sweep(algorithms.make_trainer(config))
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
@@ -233,10 +241,9 @@ def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) 
     compile_seconds = time.perf_counter() - start
     state = sweep.advance(state, 299, False)
 
-    def once(steps):
+    def once(steps: int) -> Array:
         nonlocal state
         state = sweep.advance(state, steps, True)
         return state.env_steps
 
-    rate, _ = measure(once, **timing)
-    return Row("loop", f"{algo} on {task}, {physics}", members, "env steps", rate * members, compile_seconds)
+    return once, compile_seconds

@@ -13,9 +13,12 @@ from sqt_jax.envs import physics
 def test_ratios_are_those_of_one_task_and_number_of_members():
     rates = {"MuJoCo alone": 100.0, "mujoco": 90.0, "mjx": 50.0, "mjx, the file's iterations": 20.0}
     rows = [bench.Row("physics", f"ant, {what}", 5, "env steps", rate, 0.0) for what, rate in rates.items()]
+    loops = {"td3 on ant, mjx": 200.0, "td3 on ant, mujoco": 250.0, "td3 on walker, mujoco": 300.0}
+    rows += [bench.Row("loop", what, 5, "env steps", rate, 0.0) for what, rate in loops.items()]
     assert bench.ratios(rows) == [
         "ant, 5 members: mujoco / MuJoCo alone = 0.90",
         "ant, 5 members: mjx / mjx, the file's iterations = 2.50",
+        "td3 on ant, 5 members: mujoco / mjx = 1.25",
     ]
 
 

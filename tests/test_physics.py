@@ -26,7 +26,7 @@ def test_most_simulators_run_anywhere(name):
 
 def test_warp_wants_its_package(monkeypatch):
     monkeypatch.setattr(physics, "find_spec", lambda name: None)
-    assert physics.lacks("warp") == "the package warp-lang (pip install 'sqt_jax[warp]')"
+    assert physics.lacks("warp") == "the package warp-lang (pip install -e '.[warp]')"
 
 
 @pytest.mark.parametrize(

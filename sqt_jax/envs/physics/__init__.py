@@ -60,7 +60,7 @@ PHYSICS = {
 
 def _warp_lacks() -> str:
     if find_spec("warp") is None:
-        return "the package warp-lang (pip install 'sqt_jax[warp]')"
+        return "the package warp-lang (pip install -e '.[warp]')"
     device = jax.devices()[0]
     # a GPU of another maker is a "gpu" too
     if device.platform != "gpu" or "cuda" not in device.client.platform_version.lower():
