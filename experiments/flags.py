@@ -37,7 +37,7 @@ KEEP_CHECKPOINTS = 2
 
 # What each setting is, for --help: a new field of the configuration becomes a flag by itself and wants a line here.
 SETTING_HELP = {
-    "physics": "what computes the environment's physics",
+    "physics": "what computes the environment's physics: mjx, mujoco, warp; brax:ENV has others",
     "eval_physics": "the same for evaluation; auto: mujoco on a CPU, else the training's",
     "steps": "environment steps per member",
     "warmup_steps": "first steps, with uniform random actions and no updates",

@@ -89,6 +89,20 @@ def test_updates_per_step_and_num_envs_multiply():
     assert state.env_steps == 60 and state.agent.gradient_steps == 5 * 4 * 3
 
 
+def test_diverged_physics_are_counted_and_never_reach_the_replay():
+    config, _, sweep = make("td3", probe_envs.diverging)
+    state, metrics = advance(sweep, start(config, sweep), 40, False)
+    rows = np.asarray(state.replay.storage[:, :40])  # obs, action, next_obs, reward, discount
+    broken = rows[..., 1] > 0
+    assert np.isfinite(rows).all() and broken.any(axis=1).all()
+    np.testing.assert_array_equal(metrics["unstable_steps"], broken.sum(axis=1))
+    np.testing.assert_array_equal(rows[..., 4], ~broken)  # the episode terminated
+    np.testing.assert_array_equal(rows[..., 3], ~broken)  # with reward 0
+    np.testing.assert_array_equal(rows[..., 2], rows[..., 0])  # this task's state never changes
+    state, metrics = advance(sweep, state, 30, True)
+    assert np.isfinite(metrics["critic_loss"]).all() and np.isfinite(state.replay.storage).all()
+
+
 def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):
     config, _, sweep = make.__wrapped__("td3")
     state = start(config, sweep)
