@@ -29,9 +29,10 @@ from experiments.measure import (
     bench_replay,
     bench_update,
 )
+from experiments.measure_checkpoints import bench_checkpoint
 from sqt_jax import algorithms, envs
 
-SUITES = ("env", "physics", "update", "replay", "loop")
+SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
@@ -98,6 +99,9 @@ def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterat
                     for what in ("insert", "sample")
                     for size in FLAGS.capacities
                 )
+            elif suite == "checkpoint":
+                for algo, task in itertools.product(algos, tasks):
+                    yield from bench_checkpoint(algo, task, count, timing["repeats"])
             elif suite == "loop":
                 for algo, task in itertools.product(algos, tasks):
                     yield from bench_loops(algo, task, count, physics, **timing)
