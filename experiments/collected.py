@@ -208,8 +208,9 @@ def collect(paths: Sequence[str]) -> Collected:
     Raises:
       UsageError: there is no run, one cannot be read, or two of them hold the same seed of the same settings.
     """
-    notes, curves = [], []
-    for path in find(paths):
+    runs, notes = find(paths)
+    curves = []
+    for path in runs:
         found = read_run(path)
         if not found:
             notes.append(f"left out: {path} has no evaluation yet")
@@ -219,16 +220,17 @@ def collect(paths: Sequence[str]) -> Collected:
     return arrange(pool(curves), notes)
 
 
-def find(paths: Sequence[str]) -> list[Path]:
-    """The folders with a config.json among `paths` and below them, each once."""
+def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """The folders with a config.json among `paths` and below them, each once; and what was left out."""
     found: dict[Path, Path] = {}  # by their real paths
+    notes = []
     for text in paths:
         path = Path(text)
         try:
             if not path.is_dir():
                 what = "is no folder" if path.exists() else "there is no such folder"
                 raise UsageError(f"{text}: {what}; RUNS takes folders of runs or folders above them")
-            below = list(_below(path))
+            below, without = _below(path)
         except (OSError, ValueError) as error:
             if isinstance(error, UsageError):
                 raise
@@ -237,18 +239,25 @@ def find(paths: Sequence[str]) -> list[Path]:
             raise UsageError(f"{text}: holds no run (there is no config.json in it or below it)")
         for run in below:
             found.setdefault(run.resolve(), run)
-    return list(found.values())
+        notes += [f"left out: {folder} has an evaluations.csv, but no config.json" for folder in without]
+    return list(found.values()), notes
 
 
-def _below(path: Path) -> Iterable[Path]:
+def _below(path: Path) -> tuple[list[Path], list[Path]]:
+    """Folders with a config.json, and those with an evaluations.csv alone."""
+
     def fail(error: OSError) -> None:
         raise error
 
+    runs, without = [], []
     for parent, folders, names in os.walk(path, onerror=fail):
         folders.sort()
         if "config.json" in names:
             folders.clear()  # its own, such as checkpoint/
-            yield Path(parent)
+            runs.append(Path(parent))
+        elif "evaluations.csv" in names:
+            without.append(Path(parent))
+    return runs, without
 
 
 def read_run(path: Path) -> list[Curves]:
@@ -275,7 +284,9 @@ def read_run(path: Path) -> list[Curves]:
         own = {name: column[order] for name, column in own.items()}
         if (np.diff(own["env_steps"]) == 0).any() or not (own["seed"] == member.seed).all():
             raise UsageError(f"{path}: its evaluations.csv is damaged: member {index} has other rows than it should")
-        settings = member.config.flat() | {"replay_capacity": run.content["replay_rows"]}
+        settings, rows = member.config.flat(), run.content["replay_rows"]
+        # A larger one trains the same; a run that was gone on with has that of its first steps.
+        settings["replay_capacity"] = rows if rows < settings["steps"] else "all"
         if isinstance(evaluated_on, str):
             settings["eval_physics"] = evaluated_on
         found.append(Curves(path, member.seed, settings, run.content["versions"], own))

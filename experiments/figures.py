@@ -167,6 +167,7 @@ def penalty_sweep(collected: Collected, statistic: str) -> Figure | None:
     for (task, found), axes in zip(sweeps.items(), grid.flat, strict=False):
         axes.set_title(task, fontsize="medium")
         step = min(np.diff([g.settings["penalty_coef"] for g in alike]).min() for alike in found)
+        coefs: set[float] = set()
         for index, alike in enumerate(found):
             shift = (index - (len(found) - 1) / 2) * step * 0.12
             base = collected.base(alike[0]).group
@@ -174,10 +175,11 @@ def penalty_sweep(collected: Collected, statistic: str) -> Figure | None:
                 alike = [base, *alike]
             _draw_sweep(axes, alike, shift, step, statistic, style)
             for group in alike:
-                coef = setting_text(group.settings["penalty_coef"])
-                stars.add(group.algo, f"{group.algo} at {coef} on {task}", group.notes)
+                coef = group.settings["penalty_coef"]
+                stars.add(group.algo, f"{group.algo} at {setting_text(coef)} on {task}", group.notes)
+                coefs.add(coef)
                 drawn.add(group.algo)
-        axes.set_xticks(sorted({g.settings["penalty_coef"] for alike in found for g in alike}))
+        axes.set_xticks(sorted(coefs))
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         _dress(axes, steps=False)
     handles = [_handle(style[row.label], stars.starred(row.label), "o") for row in rows if row.algo in drawn]
@@ -398,6 +400,8 @@ def _dress(axes: Axes, steps: bool = True) -> None:
 
 def _shade(colour: str, shade: float) -> str:
     """Lighter towards 1, darker towards -1."""
+    if not shade:
+        return colour
     rgb = to_rgb(colour)
     red, green, blue = (part + (1 - part) * shade if shade > 0 else part * (1 + shade) for part in rgb)
     return to_hex((red, green, blue))

@@ -5,6 +5,7 @@ Exit codes: 0 done; 2 bad usage (one line, nothing written).
 
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,14 +55,19 @@ def command(argv: Sequence[str]) -> None:
         for name in member.columns
         if name.startswith("value_bias")
     )
-    names = {"return_mean": "learning_curves"}
-    drawn = {names.get(column, column): figures.over_time(runs, column, options.statistic) for column in columns}
-    drawn["penalty_sweep"] = figures.penalty_sweep(runs, options.statistic)
-    drawn["performance_profile"] = figures.performance_profile(runs)
+    draw = {
+        {"return_mean": "learning_curves"}.get(column, column): partial(
+            figures.over_time, runs, column, options.statistic
+        )
+        for column in columns
+    }
+    draw |= {"penalty_sweep": partial(figures.penalty_sweep, runs, options.statistic)}
+    draw |= {"performance_profile": partial(figures.performance_profile, runs)}
+    command_line.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
+    drawn = {name: function() for name, function in draw.items()}
     contents = {
         f"{name}.{options.format}": figures.image(figure, options.format) for name, figure in drawn.items() if figure
     }
-    command_line.refuse_existing(options.out, list(contents), options.overwrite)
     command_line.write_files(options.out, contents)
     for name in contents:
         print(options.out / name)

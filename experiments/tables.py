@@ -37,6 +37,9 @@ def command(argv: Sequence[str]) -> None:
     from experiments import collected, formats, tabulated  # these and what they bring take a second or two
 
     runs = collected.collect(options.runs)
+    if options.out:
+        names = [f"{name}.{suffix}" for name in tabulated.NAMES for suffix, _ in formats.FORMATS.values()]
+        command_line.refuse_existing(options.out, names, options.overwrite)
     tables = tabulated.make_tables(runs, options.reference, tabulated.task_sizes(runs))
     if options.out:
         contents = {
@@ -44,7 +47,6 @@ def command(argv: Sequence[str]) -> None:
             for table in tables
             for suffix, write in formats.FORMATS.values()
         }
-        command_line.refuse_existing(options.out, list(contents), options.overwrite)
         command_line.write_files(options.out, contents)
     if options.format == "terminal" and sys.stdout.isatty():
         from rich.console import Console

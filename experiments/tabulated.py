@@ -4,6 +4,7 @@ A cell that is not all it should be carries the numbers of the footnotes that sa
 else than the runs it stands for.
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ from experiments.collected import (
 )
 from experiments.published import Published
 
+NAMES = ("table1", "table2", "table2_improvement", "table3", "table3_change", "table4", "seeds")
 PAPERS_TASKS = ("cheetah", "walker", "ant", "humanoid")
 NOTHING = "-"
 
@@ -96,16 +98,17 @@ def make_tables(collected: Collected, reference: bool = False, sizes: Sequence[d
 
 def task_sizes(collected: Collected) -> list[dict[str, Any]]:
     """The sizes of the paper's tasks and the runs', from the environments themselves."""
+    return [dict(_sizes(name)) for name in dict.fromkeys([*PAPERS_TASKS, *collected.tasks])]
+
+
+@functools.cache
+def _sizes(name: str) -> Mapping[str, Any]:
     from sqt_jax import envs  # brings JAX
 
-    found = []
-    for name in dict.fromkeys([*PAPERS_TASKS, *collected.tasks]):
-        physics = "mujoco" if "mujoco" in envs.simulators(name) else None
-        env = envs.make(name, physics)
-        task = envs.TASKS[name].gymnasium_id if name in envs.TASKS else f"Brax {name.partition(':')[2]}"
-        sizes = {"observation": env.observation_size, "action": env.action_size, "episode_steps": env.episode_length}
-        found.append({"env": name, "task": task} | sizes)
-    return found
+    env = envs.make(name, "mujoco" if "mujoco" in envs.simulators(name) else None)
+    task = envs.TASKS[name].gymnasium_id if name in envs.TASKS else f"Brax {name.partition(':')[2]}"
+    sizes = {"observation": env.observation_size, "action": env.action_size, "episode_steps": env.episode_length}
+    return {"env": name, "task": task} | sizes
 
 
 def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> Table:
