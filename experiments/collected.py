@@ -73,6 +73,11 @@ class Group:
             rows.append(member.columns[column][kept] if column in member.columns else np.full(kept.sum(), math.nan))
         return np.stack(rows)
 
+    def columns(self, start: str) -> list[str]:
+        """The columns whose names start so, which some of its seeds have."""
+        names = dict.fromkeys(name for member in self.members for name in member.columns)
+        return [name for name in names if name.startswith(start)]
+
     @cached_property
     def score(self) -> statistics.Score | None:
         return statistics.score(self.values("return_mean"))

@@ -163,26 +163,26 @@ def penalty_sweep(collected: Collected, statistic: str) -> Figure | None:
     grid = figure.subplots(count, columns, squeeze=False)
     for axes in grid.flat[len(sweeps) :]:
         axes.set_visible(False)
-    drawn = set()
+    drawn: list[Group] = []
     for (task, found), axes in zip(sweeps.items(), grid.flat, strict=False):
         axes.set_title(task, fontsize="medium")
-        step = min(np.diff([g.settings["penalty_coef"] for g in alike]).min() for alike in found)
-        coefs: set[float] = set()
-        for index, alike in enumerate(found):
-            shift = (index - (len(found) - 1) / 2) * step * 0.12
+        lines = []
+        for alike in found:
             base = collected.base(alike[0]).group
-            if base and base.settings["penalty"] == "none" and alike[0].settings["penalty_coef"] > 0:
-                alike = [base, *alike]
-            _draw_sweep(axes, alike, shift, step, statistic, style)
-            for group in alike:
-                coef = group.settings["penalty_coef"]
-                stars.add(group.algo, f"{group.algo} at {setting_text(coef)} on {task}", group.notes)
-                coefs.add(coef)
-                drawn.add(group.algo)
-        axes.set_xticks(sorted(coefs))
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            plain = base and base.settings["penalty"] == "none" and alike[0].settings["penalty_coef"] > 0
+            lines.append([base, *alike] if base and plain else alike)
+        coefs = sorted({group.settings["penalty_coef"] for line in lines for group in line})
+        for index, line in enumerate(lines):
+            shift = (index - (len(lines) - 1) / 2) * 0.12
+            _draw_sweep(axes, line, coefs, shift, statistic, style, drawn)
+            for group in line:
+                coef = setting_text(group.settings["penalty_coef"])
+                stars.add(group.algo, f"{group.algo} at {coef} on {task}", group.notes)
+        # As far apart as they are many: coefficients are often chosen as powers.
+        axes.set_xticks(range(len(coefs)), [setting_text(coef) for coef in coefs])
         _dress(axes, steps=False)
-    handles = [_handle(style[row.label], stars.starred(row.label), "o") for row in rows if row.algo in drawn]
+    algos = {group.algo for group in drawn}
+    handles = [_handle(style[row.label], stars.starred(row.label), "o") for row in rows if row.algo in algos]
     figure.legend(handles=handles, frameon=False, fontsize="small", loc="outside right center", handlelength=3)
     heading = f"Score against penalty_coef: {NAMES[statistic]} and its 95 % bootstrap interval, dots: seeds"
     figure.suptitle(_wrapped(figure, heading), fontsize="medium")
@@ -356,24 +356,34 @@ def _draw_group(axes: Axes, group: Group, column: str, statistic: str, style: St
 
 
 def _draw_sweep(
-    axes: Axes, groups: Sequence[Group], shift: float, step: float, statistic: str, style: Mapping[str, Style]
+    axes: Axes,
+    line: Sequence[Group],
+    coefs: Sequence[float],
+    shift: float,
+    statistic: str,
+    style: Mapping[str, Style],
+    drawn: list[Group],
 ) -> None:
+    """A line through the groups; a base that another line has `drawn` already is not drawn again."""
     function = STATISTICS[statistic]
     places, middles = [], []
-    look = style[groups[-1].algo]
-    for group in groups:
+    for group in line:
         if group.scores is None:
             continue
-        place, middle = group.settings["penalty_coef"] + shift, float(function(group.scores))
+        place = coefs.index(group.settings["penalty_coef"]) + (shift if group.settings["penalty"] != "none" else 0.0)
+        middle = float(function(group.scores))
         places.append(place)
         middles.append(middle)
-        own = style[group.algo]
-        dots = np.full(len(group.scores), place + step * 0.12)
-        axes.scatter(dots, group.scores, s=16, color=own.colour, alpha=0.45, linewidth=0, zorder=2)
+        if any(group is other for other in drawn):
+            continue
+        drawn.append(group)
+        colour = style[group.algo].colour
+        dots = np.full(len(group.scores), place + 0.05)
+        axes.scatter(dots, group.scores, s=16, color=colour, alpha=0.45, linewidth=0, zorder=2)
         if len(group.scores) > 1:
-            low, high = statistics.bootstrap(function, group.scores)
-            axes.plot([place, place], [low, high], color=own.colour, linewidth=1.4, zorder=3)
-        axes.plot([place], [middle], "o", color=own.colour, markersize=6, zorder=4)
+            axes.plot([place, place], statistics.bootstrap(function, group.scores), color=colour, zorder=3)
+        axes.plot([place], [middle], "o", color=colour, markersize=6, zorder=4)
+    look = style[line[-1].algo]
     axes.plot(places, middles, color=look.colour, linestyle=look.line, linewidth=1.4, zorder=3)
 
 

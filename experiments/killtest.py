@@ -135,7 +135,7 @@ def child(command: Sequence[str], task: str, log: Path, die_at: int | None, coun
 def start(job: Job, die_at: int | None = None, count_into: Path | None = None) -> Any:
     # Forked from a server that has imported everything and computed nothing: a process starts in no time.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.plots"])
+    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.figures"])
     arguments = (job.command(), job.task, job.folder / "log.txt", die_at, count_into)
     process = context.Process(target=child, args=arguments)
     process.start()

@@ -47,14 +47,8 @@ def command(argv: Sequence[str]) -> None:
     from experiments import collected, figures  # these and what they bring take a second or two
 
     runs = collected.collect(options.runs)
-    columns = dict.fromkeys(["return_mean", "q_std"])
-    columns |= dict.fromkeys(
-        name
-        for group in runs.groups
-        for member in group.members
-        for name in member.columns
-        if name.startswith("value_bias")
-    )
+    biases = [column for group in runs.groups for column in group.columns("value_bias")]
+    columns = dict.fromkeys(["return_mean", "q_std", *biases])
     draw = {
         {"return_mean": "learning_curves"}.get(column, column): partial(
             figures.over_time, runs, column, options.statistic

@@ -13,11 +13,13 @@ import numpy as np
 
 from experiments import published, statistics
 from experiments.collected import (
+    PENALTY,
     PROTOCOL,
     Collected,
     Group,
     Row,
     base_algorithm,
+    differing,
     row_differences,
     setting_text,
 )
@@ -176,7 +178,8 @@ def table_4(collected: Collected, reference: bool) -> Table:
                 if found:
                     pairs[task] = Comparison(group, found[0])
                 elif task in other.groups:
-                    pairs[task] = Comparison(group, None, f"{row.label} and {other.label} on {task} differ in more")
+                    why = differing(group, other.groups[task], PENALTY)
+                    pairs[task] = Comparison(group, None, f"not compared: {why}")
             label = f"{row.label} against {other.label}"
             line, records = _compared(label, pairs, collected.tasks, lambda group: group.scores, notes)
             # The last two cells are over tasks, here in the columns of steps and UTD: beneath the label instead.
@@ -286,11 +289,12 @@ def _q_std_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str
     found = spread(values)
     lines, numbers = _spread_lines(found, len(group.seeds)), found | {"per_seed": _joined(values)}
     if bias is not None:
-        theirs = spread(bias)
-        lines = (*lines, f"bias {number(theirs['mean'], sign=True)} ± {number(theirs['std'])}")
-        numbers |= {f"value_bias_{name}": value for name, value in theirs.items()} | {
-            "value_bias_per_seed": _joined(bias)
-        }
+        lines = (*lines, f"bias {number(bias.mean(), sign=True)} ± {number(bias.std())}")
+    for column in group.columns("value_bias"):
+        measured = group.mean_of(column)
+        if measured is not None:
+            numbers |= {f"{column}_{name}": value for name, value in spread(measured).items()}
+            numbers |= {f"{column}_per_seed": _joined(measured)}
     return lines, numbers, []
 
 
@@ -482,7 +486,7 @@ def _interval(low: float | None, high: float | None) -> str:
 
 
 def _joined(values: Iterable[Any]) -> str:
-    return " ".join(f"{value:g}" for value in values)
+    return " ".join(f"{value:.10g}" for value in values)
 
 
 def _float(value: Any) -> float | None:

@@ -158,8 +158,25 @@ def test_a_sweep_has_a_dot_per_seed_and_the_base_at_nothing(tmp_path):
     (axes,) = panels(figure)
     assert [scatter.get_offsets()[:, 1].tolist() for scatter in axes.collections] == [[5, 7], [1, 3], [2, 4]]
     (line,) = [line for line in lines_of(axes, ALGORITHM_COLOURS["td3_sqt"]) if len(line) == 3]
-    np.testing.assert_allclose(line, [[0, 6], [0.25, 2], [0.5, 3]])
-    assert legend_of(figure) == ["td3", "td3_sqt"] and axes.get_xticks().tolist() == [0, 0.25, 0.5]
+    np.testing.assert_allclose(line, [[0, 6], [1, 2], [2, 3]])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.25", "0.5"]
+    assert legend_of(figure) == ["td3", "td3_sqt"]
+
+
+def test_sweeps_of_one_base_draw_it_once(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 0, 5]])
+    for algo in ("td3_sqt", "td3_sqt_tuple"):
+        write_run(tmp_path, algo, curves=[[0, 0, 1], [0, 0, 2]], swept={"penalty_coef": (0.25, 0.5)})
+    (axes,) = panels(penalty_sweep(collect([str(tmp_path)]), "mean"))
+    assert sum(scatter.get_offsets()[:, 1].tolist() == [5] for scatter in axes.collections) == 1
+    assert len(axes.collections) == 5
+
+
+@pytest.mark.parametrize("other", [{"steps": 200}, {"tau": 0.1}])
+def test_coefficients_of_runs_that_differ_otherwise_are_no_sweep(tmp_path, other):
+    write_run(tmp_path / "a", "td3_sqt", penalty_coef=0.1)
+    write_run(tmp_path / "b", "td3_sqt", penalty_coef=0.5, **other)
+    assert penalty_sweep(collect([str(tmp_path)]), "mean") is None
 
 
 def test_profile_by_hand(tmp_path):

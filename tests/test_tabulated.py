@@ -131,7 +131,7 @@ def test_a_comparison_says_which_of_the_two_is_incomplete(tmp_path):
 
 
 def test_table_3_by_hand(tmp_path):
-    bias = {"value_bias": [[9, 2, 4], [9, -1, 1]]}
+    bias = {"value_bias": [[9, 2, 4], [9, -1, 1]], "value_bias_normalised": [[NAN, 0.5, 0.5], [NAN, 0.25, 0.75]]}
     write_run(tmp_path, "td3", curves=[[0, 1, 2], [0, 1, 2]], q_std=[0.5, 0.75], more=bias)
     write_run(tmp_path, "td3_sqt", curves=[[0, 1, 2], [0, 1, 2]], q_std=[0.25, 0.25])
     runs = collect([str(tmp_path)])
@@ -141,6 +141,7 @@ def test_table_3_by_hand(tmp_path):
         "0.25 ± 0.00 (2)|0.25 [0.25, 0.25]",
     ]
     assert table.records[0]["value_bias_mean"] == 1.5 and table.records[0]["value_bias_per_seed"] == "3 0"
+    assert table.records[0]["value_bias_normalised_mean"] == 0.5
     change = named(make_tables(runs), "table3_change")
     assert cells(change)[0][1].startswith("-60.0 % [")
 
@@ -156,6 +157,14 @@ def test_table_4_by_hand(tmp_path):
         ["td3_sqt_tuple", "10.0 ± 0.00 (1)"],
         ["td3_sqt against td3_sqt_tuple", "+20.0 %|P 1.00"],
     ]
+
+
+def test_forms_that_differ_in_more_than_the_penalty_are_not_compared(tmp_path):
+    write_run(tmp_path, "td3_sqt")
+    write_run(tmp_path, "td3_sqt_tuple", tau=0.1)
+    table = table_4(collect([str(tmp_path)]), reference=False)
+    assert cells(table)[-1][:2] == ["td3_sqt against td3_sqt_tuple", "- [1]"]
+    assert table.notes == ["not compared: td3_sqt and td3_sqt_tuple on cheetah differ in tau (0.005, 0.1)"]
 
 
 def test_tables_with_nothing_in_them_are_not_made(tmp_path):
