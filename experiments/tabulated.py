@@ -182,11 +182,11 @@ def table_4(collected: Collected, reference: bool) -> Table:
                     pairs[task] = Comparison(group, None, f"not compared: {why}")
             label = f"{row.label} against {other.label}"
             line, records = _compared(label, pairs, collected.tasks, lambda group: group.scores, notes)
-            # The last two cells are over tasks, here in the columns of steps and UTD: beneath the label instead.
+            # The last two cells are over tasks, for which there are no columns here: beneath the label instead.
             over_tasks = [cell for cell in line.cells[-2:] if cell.lines != (NOTHING,)]
             words = [f"over tasks: {' '.join(cell.lines)}" for cell in over_tasks] if len(collected.tasks) > 1 else []
             line.cells[0] = Cell((label, *words))
-            lines.append(Line([*line.cells[:-2], Cell(("",)), Cell(("",))]))
+            lines.append(Line([*line.cells[:-2], *(Cell(("",)) for _ in range(3))]))
             table.records.extend(records)
     return table._replace(sections=[*table.sections, lines] if lines else table.sections, notes=notes.texts)
 
@@ -256,6 +256,8 @@ def _algorithms(
                     why.append(f"fewer seeds than other cells, which have {most}")
                 cells.append(Cell(text, notes(*why)))
                 records.append(_record(row, group, quantity, numbers, why))
+            coefs = dict.fromkeys(g.settings["penalty_coef"] for g in row.groups.values() if _penalised(g))
+            cells.append(Cell((" / ".join(map(setting_text, coefs)) or NOTHING,)))
             for name in ("steps", "updates_per_step"):
                 values = dict.fromkeys(group.settings[name] for group in row.groups.values())
                 cells.append(Cell((" / ".join(map(setting_text, values)),)))
@@ -266,7 +268,7 @@ def _algorithms(
         if lines:
             sections.append(lines)
     name, title, caption = table
-    header = ["algorithm", *collected.tasks, "steps", "UTD"]
+    header = ["algorithm", *collected.tasks, "penalty_coef", "steps", "UTD"]
     texts = [caption, *_protocol_notes(rows), *map(_sentence, collected.notes)]
     if figures and not any(line.published for lines in sections for line in lines):
         texts.append("Nothing published is known for these algorithms and tasks.")
@@ -341,15 +343,14 @@ def _versus_base(collected: Collected, reference: bool, name: str) -> Table:
             over_tasks = {"env": "mean over tasks", "improvement_percent": value, "source": published.PAPER}
             records.append({"comparison": label} | over_tasks)
     many = f"by how many per cent the mean {what} of the seeds exceeds the base's"
-    caption = (
-        f"Per task: {many}, and P, the probability that a seed exceeds a seed of the base (a tie counts a half). The "
-        "last columns: the means of these over the tasks compared. In brackets: 95 % intervals by stratified "
-        "bootstrap, tasks and algorithms being the strata."
-    )
+    caption = f"Per task: {many}, and P, the probability that a seed exceeds a seed of the base (a tie counts a half)."
     title = "Table 2, SQT against its base: score" if score else "Table 3, SQT against its base: std_T"
     header = ["comparison", *collected.tasks, "mean over tasks", "P over tasks"]
     if len(collected.tasks) == 1 and not any(line.published for line in lines):
         header, lines = header[:-2], [Line(line.cells[:-2]) for line in lines]
+    else:
+        caption += " The last columns: the means of these over the tasks compared."
+    caption += " In brackets: 95 % intervals by stratified bootstrap, tasks and algorithms being the strata."
     return Table(name, title, header, [lines] if lines else [], caption, notes.texts, records)
 
 
@@ -433,7 +434,9 @@ def _published_lines(figures: Sequence[Published], tasks: Sequence[str], notes: 
             figure = by_task[task]
             text = number(figure.value) + (f" ± {number(figure.std)}" if figure.std is not None else "")
             cells.append(Cell((text,), notes(*figure.notes)))
-        lines.append(Line([*cells, Cell(("1,000,000",)), Cell((utd or NOTHING,))], published=True))
+        lines.append(
+            Line([*cells, *(Cell((text,)) for text in (NOTHING, "1,000,000", utd or NOTHING))], published=True)
+        )
     return lines
 
 
@@ -478,7 +481,11 @@ def _protocol_notes(rows: Sequence[Row]) -> list[str]:
 
 
 def _has_penalty(row: Row) -> bool:
-    return any(g.settings["penalty"] != "none" and g.settings["penalty_coef"] > 0 for g in row.groups.values())
+    return any(_penalised(group) and group.settings["penalty_coef"] > 0 for group in row.groups.values())
+
+
+def _penalised(group: Group) -> bool:
+    return group.settings["penalty"] != "none"
 
 
 def _interval(low: float | None, high: float | None) -> str:

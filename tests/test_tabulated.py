@@ -48,8 +48,8 @@ def test_table_2_by_hand(tmp_path):
     # Means 0, 5, 4: the score is that of step 50, where the seeds are 4 and 6.
     write_run(tmp_path, "td3", curves=[[0, 4, 6], [0, 6, 2]])
     table = table_2(collect([str(tmp_path)]), reference=False)
-    assert table.header == ["algorithm", "cheetah", "steps", "UTD"]
-    assert cells(table) == [["td3", "5.00 ± 1.00 (2)|5.00 [4.00, 6.00]", "100", "1"]]
+    assert table.header == ["algorithm", "cheetah", "penalty_coef", "steps", "UTD"]
+    assert cells(table) == [["td3", "5.00 ± 1.00 (2)|5.00 [4.00, 6.00]", "-", "100", "1"]]
     assert table.notes == []
     (record,) = table.records
     numbers = {"mean": 5, "std": 1, "iqm": 5, "mean_low": 4, "mean_high": 6, "iqm_low": 4, "iqm_high": 6}
@@ -66,8 +66,8 @@ def test_incomplete_cells_are_marked_and_missing_ones_not_filled(tmp_path):
     write_run(tmp_path, "sac", "cheetah", curves=[[0, 3]])
     table = table_2(collect([str(tmp_path)]), reference=False)
     assert cells(table) == [
-        ["td3", "2.00 ± 0.00 (3)|2.00 [2.00, 2.00]", "1.00 ± 0.00 (3)|1.00 [1.00, 1.00] [1]", "100", "1"],
-        ["sac", "3.00 ± 0.00 (1) [2, 3]", "- [4]", "100", "1"],
+        ["td3", "2.00 ± 0.00 (3)|2.00 [2.00, 2.00]", "1.00 ± 0.00 (3)|1.00 [1.00, 1.00] [1]", "-", "100", "1"],
+        ["sac", "3.00 ± 0.00 (1) [2, 3]", "- [4]", "-", "100", "1"],
     ]
     assert table.notes == [
         "seed 1 diverged after step 50: no evaluation after that counts",
@@ -89,7 +89,7 @@ def test_what_a_rows_tasks_do_not_share_is_said(tmp_path):
     write_run(tmp_path, "td3_sqt", "cheetah", penalty_coef=0.5)
     write_run(tmp_path, "td3_sqt", "ant", penalty_coef=0.25, steps=200, physics="mujoco")
     table = table_2(collect([str(tmp_path)]), reference=False)
-    assert cells(table)[0][0] == "td3_sqt [1]" and cells(table)[0][-2:] == ["100 / 200", "1"]
+    assert cells(table)[0][0] == "td3_sqt [1]" and cells(table)[0][-3:] == ["0.5 / 0.25", "100 / 200", "1"]
     assert table.notes[0] == "penalty_coef: 0.5 (cheetah), 0.25 (ant)"
     assert "physics is mjx, but mujoco for td3_sqt on ant." in table.caption
     assert "Common to all: warmup_steps 10, eval_physics mujoco" in table.caption
@@ -186,7 +186,7 @@ def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
     ours = labels.index("td3_sqt")
     released = rows[ours + 1]
     assert released[0] == f"published: td3_sqt, environment Gym v2, 5 seeds|{published.RELEASED}"
-    assert released[1:] == ["6,648 ± 553", "-", "1,000,000", "2"]  # v2's are not v5's
+    assert released[1:] == ["6,648 ± 553", "-", "-", "1,000,000", "2"]  # v2's are not v5's
     (broken,) = [row for row in rows if row[0] == released[0].replace("td3_sqt", "td3")]
     assert broken[1] == "5,043 ± 2,383 [1, 2]" and published.NEVER_LEARNS in table.notes
     sources = [record["source"] for record in table.records]
