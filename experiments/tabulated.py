@@ -376,8 +376,7 @@ def _compared(
             cells.append(Cell((NOTHING,), notes(*(why or ["nothing measured that could be compared"]))))
             continue
         found = _against(x, y)
-        if found["improvement_percent"] is None:
-            why.append("no percentage: the other mean is not positive")
+        why += _percentage_notes(found)
         marks = notes(*why)
         all_marks |= set(marks)
         strata += [x, y]
@@ -392,7 +391,8 @@ def _compared(
     found = _against(*strata)
     lines = _against_lines(found)
     missing = len(strata) // 2 < len(tasks)
-    marks = tuple(sorted(all_marks | set(notes("not over all tasks") if missing else ())))
+    why = _percentage_notes(found) + (["not over all tasks"] if missing else [])
+    marks = tuple(sorted(all_marks | set(notes(*why))))
     cells += [Cell((lines[0],), marks), Cell((lines[1],), marks)]
     over = {"comparison": label, "env": "mean over tasks"} | found
     return Line(cells), [*records, over | {"notes": "; ".join(notes.texts[mark - 1] for mark in marks)}]
@@ -407,6 +407,15 @@ def _against(*strata: np.ndarray) -> dict[str, float | None]:
         low, high = (None, None) if single else statistics.bootstrap(function, *strata)
         found |= {key: _float(function(*strata)), f"{name}_low": _float(low), f"{name}_high": _float(high)}
     return found
+
+
+def _percentage_notes(found: Mapping[str, float | None]) -> list[str]:
+    """Why there is no percentage, or no interval of it."""
+    if found["improvement_percent"] is None:
+        return ["no percentage: the other mean is not positive"]
+    if found["improvement_low"] is None and found["probability_low"] is not None:
+        return ["no interval of the percentage: the other mean is not positive in some resamples"]
+    return []
 
 
 def _against_lines(found: Mapping[str, float | None]) -> tuple[str, str]:

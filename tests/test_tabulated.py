@@ -123,6 +123,14 @@ def test_improvement_over_a_base_that_lost_or_is_not_there(tmp_path):
     ]
 
 
+def test_a_percentage_without_an_interval_says_why(tmp_path):
+    write_run(tmp_path, "td3", curves=[[-9, -9, 5], [-9, -9, -1]])
+    write_run(tmp_path, "td3_sqt", curves=[[0, 1, 3], [0, 1, 3]])
+    table = named(make_tables(collect([str(tmp_path)])), "table2_improvement")
+    assert cells(table) == [["td3_sqt against td3", "+50.0 %|P 0.50 [0.00, 1.00] [1]"]]
+    assert table.notes == ["no interval of the percentage: the other mean is not positive in some resamples"]
+
+
 def test_a_comparison_says_which_of_the_two_is_incomplete(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 1]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 2, 3]])
