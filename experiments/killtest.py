@@ -137,7 +137,7 @@ def child(job: Job, die_at: int | None, count_into: Path | None) -> None:
 def start(job: Job, die_at: int | None = None, count_into: Path | None = None) -> Any:
     # Forked from a server that has imported everything and computed nothing: a process starts in no time.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.plots"])
+    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.figures"])
     process = context.Process(target=child, args=(job, die_at, count_into))
     process.start()
     return process

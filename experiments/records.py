@@ -7,16 +7,16 @@ import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from experiments import files
 from experiments.csv_table import Shortened, Table
 from experiments.described import Member
 from experiments.events import Events
 from experiments.loop import Outcome, Report
+from experiments.statistics import iqm, score
 from sqt_jax import bias
 
 # The columns that every evaluations.csv has; further swept scalars follow.
@@ -34,23 +34,6 @@ EVALUATION_COLUMNS = (
     "value_bias",
     "wall_seconds",
 )
-
-
-class Score(NamedTuple):
-    """The paper's "maximum average reward": the best evaluation of the mean over seeds."""
-
-    mean: float
-    std: float  # population std over the seeds, at that evaluation
-    evaluation: int  # which one it is
-
-
-def score(returns: np.ndarray) -> Score | None:
-    """Score of `returns` [seeds, evaluations]; evaluations with a NaN do not count. None if there is no other."""
-    mean = returns.mean(axis=0)
-    if not np.isfinite(mean).any():
-        return None
-    best = int(np.nanargmax(np.where(np.isfinite(mean), mean, np.nan)))
-    return Score(float(mean[best]), float(returns[:, best].std()), best)
 
 
 class RunExists(Exception):
@@ -300,7 +283,7 @@ def summarise(table: Mapping[str, np.ndarray]) -> dict[str, Any]:
                 "final": {
                     "mean": float(final.mean()),
                     "std": float(final.std()),
-                    "iqm": float(stats.trim_mean(final, 0.25)),
+                    "iqm": float(iqm(final)),
                 },
             }
         )

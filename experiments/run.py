@@ -26,7 +26,7 @@ from sqt_jax.policy import save_policy
 from sqt_jax.train import Sweep, TrainState, evaluation_steps, make_sweep
 from sqt_jax.types import Array, Environment, Scalars
 
-# `plan`, `records` and `plots` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are
+# `plan`, `records` and `figures` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are
 # imported where they are used, so that a typing error is answered in a second.
 if TYPE_CHECKING:
     from experiments.checkpoints import Checkpoints, Restored
@@ -244,7 +244,7 @@ def _train(
 
 def _results(plan: "Plan", outcome: Outcome) -> bool:
     """Writes the policies and, where there are evaluations, the curves; whether there are."""
-    from experiments import plots, records
+    from experiments import figures, records
 
     policy, part = plan.path / "policy", plan.path / "policy.part"
     shutil.rmtree(part, ignore_errors=True)
@@ -254,7 +254,7 @@ def _results(plan: "Plan", outcome: Outcome) -> bool:
     table = records.read_evaluations(plan.path / "evaluations.csv")
     if not len(table["member"]):
         return False
-    plots.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+    figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
     return True
 
 
