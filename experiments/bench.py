@@ -24,19 +24,21 @@ from experiments.measure import (
     REPLAYS,
     Row,
     bench_env,
-    bench_loop,
+    bench_loops,
     bench_physics,
     bench_replay,
     bench_update,
 )
+from experiments.measure_checkpoints import bench_checkpoint
 from sqt_jax import algorithms, envs
 
-SUITES = ("env", "physics", "update", "replay", "loop")
+SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
 flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
-flags.DEFINE_list("physics", list(envs.PHYSICS), "Physics of the suites env and loop.")
+flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itself all that can run here.")
+flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
@@ -49,17 +51,37 @@ def check_flags() -> None:
     """Leaves with one line that names the first flag with a value that cannot be."""
     known = {"suites": SUITES, "tasks": envs.TASKS, "algos": algorithms.ALGORITHMS, "physics": envs.PHYSICS}
     for name, values in known.items():
-        for value in getattr(FLAGS, name):
+        for value in getattr(FLAGS, name) or ():
             if value not in values:
                 sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
     for name in ("members", "capacities"):
         for value in getattr(FLAGS, name):
             if not value.isdecimal() or int(value) < 1:
                 sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
+    solver_limits()
 
 
-def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
-    tasks, algos, physics = FLAGS.tasks, FLAGS.algos, FLAGS.physics
+def solver_limits() -> dict[str, dict[str, int]]:
+    """--solver: each of its values -> MJX's options; leaves with one line where one cannot be."""
+    found = {}
+    for value in FLAGS.solver:
+        numbers = value.split("/")
+        if len(numbers) != 2 or not all(number.isdecimal() and int(number) for number in numbers):
+            sys.exit(f"--solver: takes pairs of whole numbers of at least 1 as in 8/8, not {value!r}")
+        found[value] = dict(zip(("iterations", "ls_iterations"), map(int, numbers), strict=True))
+    return found
+
+
+def physics_here() -> list[str]:
+    """--physics; leaves with one line where the machine lacks what one of them needs."""
+    for name in FLAGS.physics or ():
+        if missing := envs.lacks(name):
+            sys.exit(f"--physics: {name} needs {missing}")
+    return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
+
+
+def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterator[Row]:
+    tasks, algos = FLAGS.tasks, FLAGS.algos
     members = [int(value) for value in FLAGS.members]
     for suite in suites:
         for count in members:
@@ -67,7 +89,7 @@ def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
                 yield from (bench_env(task, count, name, **timing) for task in tasks for name in physics)
             elif suite == "physics":
                 for task in tasks:
-                    yield from bench_physics(task, count, **timing)
+                    yield from bench_physics(task, count, solver_limits(), **timing)
             elif suite == "update":
                 yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
             elif suite == "replay":
@@ -77,9 +99,12 @@ def rows(suites: Sequence[str], **timing: Any) -> Iterator[Row]:
                     for what in ("insert", "sample")
                     for size in FLAGS.capacities
                 )
+            elif suite == "checkpoint":
+                for algo, task in itertools.product(algos, tasks):
+                    yield from bench_checkpoint(algo, task, count, timing["repeats"])
             elif suite == "loop":
-                cases = itertools.product(algos, tasks, physics)
-                yield from (bench_loop(algo, task, count, name, **timing) for algo, task, name in cases)
+                for algo, task in itertools.product(algos, tasks):
+                    yield from bench_loops(algo, task, count, physics, **timing)
 
 
 def machine() -> dict[str, Any]:
@@ -93,15 +118,23 @@ def machine() -> dict[str, Any]:
     return {"cpu": cpu, "device": f"{device.platform}: {device.device_kind}", "jax": jax.__version__}
 
 
+# Of the suites physics and loop: what is measured against what.
+AGAINST = {
+    ("physics", "mujoco"): "MuJoCo alone",
+    ("physics", "mjx"): "mjx, the file's iterations",
+    ("loop", "mujoco"): "mjx",
+}
+
+
 def ratios(all_rows: Sequence[Row]) -> list[str]:
-    """What the suite physics is for: each physics against MuJoCo alone, and MJX against the file's settings."""
-    rates = {(r.what, r.members): r.rate for r in all_rows if r.suite == "physics"}
+    """What these suites are for: each physics against MuJoCo alone, MJX against the file's settings, whole loops."""
+    rates = {(r.suite, r.what, r.members): r.rate for r in all_rows}
     lines = []
-    for (what, members), rate in rates.items():
+    for (suite, what, members), rate in rates.items():
         task, _, physics = what.partition(", ")
-        for reference in {"mujoco": "MuJoCo alone", "mjx": "mjx, the file's iterations"}.get(physics, "").splitlines():
-            ratio = rate / rates[f"{task}, {reference}", members]
-            lines.append(f"{task}, {members} members: {physics} / {reference} = {ratio:.2f}")
+        reference = AGAINST.get((suite, physics), "")
+        if other := rates.get((suite, f"{task}, {reference}", members)):
+            lines.append(f"{task}, {members} members: {physics} / {reference} = {rate / other:.2f}")
     return lines
 
 
@@ -121,7 +154,7 @@ def main(argv: Sequence[str]) -> None:
     console = Console()
     console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
     found = []
-    for row in rows(FLAGS.suites, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
+    for row in rows(FLAGS.suites, physics_here(), seconds=FLAGS.seconds, repeats=FLAGS.repeats):
         found.append(row)
         console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
     table = Table("suite", "what", "members", "rate", "unit", "compile s", title="median of repeats")

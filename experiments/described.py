@@ -106,7 +106,7 @@ def read(path: Path) -> Described:
     except OSError as error:
         raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None
     except ConfigError as error:
-        raise NotDescribed(f"its {NAME} names a setting that cannot be: {error}") from None
+        raise NotDescribed(f"its {NAME} names a setting that cannot be: {str(error)[:300]}") from None
     except NotDescribed:
         raise
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
@@ -119,11 +119,14 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
-def resumed(content: dict[str, Any], steps: int, env_steps: int, command: Sequence[str]) -> dict[str, Any]:
+def resumed(
+    content: dict[str, Any], steps: int, output: Mapping[str, Any], env_steps: int, command: Sequence[str]
+) -> dict[str, Any]:
     """config.json of a run that is gone on with at `env_steps`, to `steps`."""
     entry = {"env_steps": env_steps, "at": _now(), "command": list(command)}
     entry |= {"commit": _commit(), "versions": versions()}
-    return content | {"settings": content["settings"] | {"steps": steps}, "resumed": [*content["resumed"], entry]}
+    settings = content["settings"] | {"steps": steps}
+    return content | {"settings": settings, "output": dict(output), "resumed": [*content["resumed"], entry]}
 
 
 def versions() -> dict[str, str | None]:

@@ -32,11 +32,12 @@ ABSL_FLAGS = ("flagfile", "undefok")
 # The run's own flags that a resumed run takes over; the smallest value of each.
 OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "tensorboard": False}
 CHECKPOINT_EVERY = 25_000
+LATEST = "\n"  # no folder's name on a command line
 KEEP_CHECKPOINTS = 2
 
 # What each setting is, for --help: a new field of the configuration becomes a flag by itself and wants a line here.
 SETTING_HELP = {
-    "physics": "what computes the environment's physics",
+    "physics": "what computes the environment's physics: mjx, mujoco, warp; brax:ENV has others",
     "eval_physics": "the same for evaluation; auto: mujoco on a CPU, else the training's",
     "steps": "environment steps per member",
     "warmup_steps": "first steps, with uniform random actions and no updates",
@@ -100,7 +101,7 @@ class Options(NamedTuple):
     preset: str
     out: str
     name: str | None
-    resume: str | None  # the folder of a run; "": the one that these settings belong to
+    resume: str | None  # the folder of a run; LATEST: the one that these settings belong to
     overwrite: bool
     checkpoint_every: int | None
     keep_checkpoints: int | None
@@ -288,10 +289,10 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_resume_valued(argv: Sequence[str]) -> list[str]:
-    """`--resume` alone, at the end or before another flag, as `--resume=`."""
+    """`--resume` alone, at the end or before another flag, as `--resume=LATEST`."""
     following = [*argv[1:], "-"]
     return [
-        f"{word}=" if word.lstrip("-") == "resume" and word != "resume" and after.startswith("-") else word
+        f"{word}={LATEST}" if word.lstrip("-") == "resume" and word != "resume" and after.startswith("-") else word
         for word, after in zip(argv, following, strict=True)
     ]
 
@@ -349,13 +350,16 @@ def parse(argv: Sequence[str]) -> Options | None:
     own = {name: values.pop(name, None) for name in ("algo", "env", "seeds", "preset", "out", "name")}
     output = {name: values.pop(name, None) for name in OUTPUT}
     resume, overwrite = values.pop("resume", None), values.pop("overwrite", False)
+    if resume == "":
+        raise UsageError("--resume=: takes the folder of a run, or nothing at all: --resume")
+    folder_given = resume not in (None, LATEST)
     for required in ("algo", "env"):
-        if not own[required] and not resume:
+        if not own[required] and resume in (None, LATEST):
             raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
     if resume is not None and overwrite:
         raise UsageError("--overwrite: takes no --resume beside it: the one replaces a run, the other goes on with it")
     for name in ("out", "name", "preset"):
-        if resume and own[name] is not None:
+        if folder_given and own[name] is not None:
             raise UsageError(f"--{name}: has no effect with --resume={resume}")
     for name, lowest in OUTPUT.items():
         if output[name] is not None and output[name] < lowest:
@@ -367,15 +371,18 @@ def parse(argv: Sequence[str]) -> Options | None:
 
     name = own["name"]
     if name is not None and (
-        name in ("", ".", "..") or set(name) & set("/\\") or not name.isprintable() or len(name.encode()) > 200
+        name in ("", ".", "..")
+        or name[0] == "-"
+        or set(name) & set("/\\")
+        or not name.isprintable()
+        or len(name.encode()) > 200
     ):
         raise UsageError(
             f"--name={name[:40]}: takes up to 200 bytes, no slashes or control characters: it names a folder"
         )
-    for folder in ("out", "resume"):
-        given = {"out": own["out"], "resume": resume}[folder]
-        if given is not None and ((folder == "out" and not given) or not _is_path(given)):
-            raise UsageError(f"--{folder}={given[:40]}: takes a folder")
+    for flag, folder in (("out", own["out"]), ("resume", resume if folder_given else None)):
+        if folder is not None and not (folder and _is_path(folder)):
+            raise UsageError(f"--{flag}={folder[:40]}: takes a folder")
 
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
@@ -402,7 +409,7 @@ def parse(argv: Sequence[str]) -> Options | None:
     return Options(
         algo=own["algo"],
         env=own["env"],
-        seeds=_check_seeds(own["seeds"]) if own["seeds"] is not None else None if resume else DEFAULT_SEEDS,
+        seeds=_check_seeds(own["seeds"]) if own["seeds"] is not None else None if folder_given else DEFAULT_SEEDS,
         settings=settings,
         sweep=sweep,
         preset=preset,

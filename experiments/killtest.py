@@ -1,8 +1,9 @@
 """Does a run survive being killed? `python -m experiments.killtest --kills=50`.
 
 Trains once without a break. Then kills training again and again (SIGKILL), at random moments and inside the writing of
-checkpoints, goes on with `--resume`, and compares what is left in the end: every array of the training state bit for
-bit, the replay's rows, and the rows of both tables but for their times. One kill in five hits the resumed process too.
+checkpoints and of the other files of a run, goes on with `--resume`, and compares what is left in the end: every array
+of the training state bit for bit, the replay's rows, and the rows of both tables but for their times. One training in
+five is killed a second time.
 """
 
 import csv
@@ -31,7 +32,8 @@ from sqt_jax.types import Environment
 
 FLAGS = flags.FLAGS
 TASKS = ("tiny", "ant")
-COMMON = "--seeds=0,1 --hidden=16,16 --batch_size=16 --notensorboard --quiet --name=run"
+# The replay's ring goes round, and one checkpoint alone is kept.
+COMMON = "--seeds=0,1 --hidden=16,16 --batch_size=16 --replay_capacity=100 --keep_checkpoints=1 --quiet --name=run"
 SETTINGS = {
     "tiny": "--steps=240 --warmup_steps=40 --eval_every=70 --eval_episodes=2 --checkpoint_every=20",
     "ant": "--steps=240 --warmup_steps=40 --eval_every=100 --eval_episodes=1 --checkpoint_every=40",
@@ -60,7 +62,7 @@ class Reference(NamedTuple):
 
     result: dict[str, Any]
     seconds: float  # from the first table to the end
-    file_events: int  # in the checkpoints' folder
+    file_events: int  # in the run's folder
 
 
 def tiny_env() -> Environment:
@@ -111,22 +113,22 @@ def _same(a: Any, b: Any) -> bool:
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
-def child(command: Sequence[str], task: str, log: Path, die_at: int | None, count_into: Path | None) -> None:
-    """A process of its own: trains, and kills itself at the `die_at`-th file event in the checkpoints' folder."""
-    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+def child(job: Job, die_at: int | None, count_into: Path | None) -> None:
+    """A process of its own: trains, and kills itself at the `die_at`-th file event in the run's folder."""
+    descriptor = os.open(job.folder / "log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
     events = 0
 
     def watch(event: str, arguments: tuple) -> None:
         nonlocal events
-        if event in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") and "/checkpoint/" in str(arguments[0]):
+        if event in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") and str(job.path) in str(arguments[0]):
             events += 1
             if events == die_at:
                 os.kill(os.getpid(), signal.SIGKILL)
 
     sys.addaudithook(watch)
-    code = run.main(command, tiny_env() if task == "tiny" else None)
+    code = run.main(job.command(), tiny_env() if job.task == "tiny" else None)
     if count_into:
         count_into.write_text(str(events))
     os._exit(code)
@@ -135,9 +137,8 @@ def child(command: Sequence[str], task: str, log: Path, die_at: int | None, coun
 def start(job: Job, die_at: int | None = None, count_into: Path | None = None) -> Any:
     # Forked from a server that has imported everything and computed nothing: a process starts in no time.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.plots"])
-    arguments = (job.command(), job.task, job.folder / "log.txt", die_at, count_into)
-    process = context.Process(target=child, args=arguments)
+    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.figures"])
+    process = context.Process(target=child, args=(job, die_at, count_into))
     process.start()
     return process
 
@@ -186,9 +187,9 @@ def kill_and_resume(task: str, algo: str, folder: Path, whole: Reference, number
     chance = random.Random(number)
     job = Job(task, algo, folder)
     folder.mkdir()
-    told = []
-    for _ in range(2 if chance.random() < 0.2 else 1):
-        told.append(_kill(job, chance, whole))
+    told = [_kill(job, chance, whole)]
+    if chance.random() < 0.2:
+        told.append(_kill_once(job, chance.random() < 0.5, chance.random(), whole) or "not again (it had ended)")
     steps = sorted((job.path / "checkpoint").glob("step_*")) if (job.path / "checkpoint").exists() else []
     last = f"step {int(steps[-1].name[5:15])}" if steps else "none"
     code = finish(start(job))
@@ -202,24 +203,33 @@ def kill_and_resume(task: str, algo: str, folder: Path, whole: Reference, number
 
 
 def _kill(job: Job, chance: random.Random, whole: Reference) -> str:
-    """Kills one process of a training, and when; again and earlier where it ended before."""
+    """Kills a training, and says when; a new one and earlier where it ended before."""
     inside, share = chance.random() < 0.5, chance.random()
-    while True:
-        if inside:
-            event = 1 + int(share * whole.file_events)
-            process, when = start(job, die_at=event), f"at file event {event}"
-        else:
-            process, moment = start(job), share * whole.seconds
-            _wait_for_tables(process, job)
-            process.join(moment)
-            process.kill()
-            when = f"after {moment:.2f} s"
-        if finish(process) == -signal.SIGKILL:
-            return when
-        if not (job.path / "checkpoint").exists():
-            raise RuntimeError(f"training alone fails: {_end_of_log(job)}")
+    while not (when := _kill_once(job, inside, share, whole)):
         shutil.rmtree(job.path)
         share *= 0.7
+    return when
+
+
+def _kill_once(job: Job, inside: bool, share: float, whole: Reference) -> str | None:
+    """Kills one process, `inside` the writing of files or at a moment, and says when; None where it ended before.
+
+    Raises:
+      RuntimeError: it ended in another way.
+    """
+    if inside:
+        event = 1 + int(share * whole.file_events)
+        process, when = start(job, die_at=event), f"at file event {event}"
+    else:
+        process, moment = start(job), share * whole.seconds
+        _wait_for_tables(process, job)
+        process.join(moment)
+        process.kill()
+        when = f"after {moment:.2f} s"
+    code = finish(process)
+    if code not in (0, -signal.SIGKILL):
+        raise RuntimeError(f"training ends with {code}: {_end_of_log(job)}")
+    return when if code else None
 
 
 def _wait_for_tables(process: Any, job: Job) -> None:

@@ -28,6 +28,7 @@ class Report(NamedTuple):
     metrics: dict[str, np.ndarray]  # name -> [S], of the steps since the last report; empty at step 0
     returns: np.ndarray | None  # [S, episodes]; None where there was no evaluation
     lengths: np.ndarray | None  # [S, episodes]
+    bias: dict[str, np.ndarray] = {}  # name -> [S], of `bias.Judgement`; empty where there was no evaluation
 
 
 class Position(NamedTuple):
@@ -136,7 +137,7 @@ def train_loop(
         nonlocal last_return, evaluated
         show("evaluating" if pace.evaluations else "compiling the evaluation", done >= train.warmup_steps)
         before = clock()
-        evaluation = sweep.evaluate(state)
+        evaluation, bias = sweep.evaluate(state)
         returns, lengths = np.asarray(evaluation.returns), np.asarray(evaluation.lengths)
         pace.evaluated(clock() - before)
         bad = find_diverged(returns)
@@ -144,7 +145,7 @@ def train_loop(
         returns = np.where(bad[:, None], np.nan, returns)
         if not bad.all():
             last_return = float(np.nanmean(returns))
-        send(returns, lengths)
+        send(returns, lengths, {name: np.where(bad, np.nan, value) for name, value in bias.items()})
         evaluated = done
         display.evaluated(done, returns[~bad].mean(axis=1))
 
@@ -160,10 +161,10 @@ def train_loop(
                 display.message(f"member {member} diverged at {step}: it stays as it was before, the others go on")
         return np.isin(np.arange(num_members), list(diverged))
 
-    def send(returns: np.ndarray | None, lengths: np.ndarray | None) -> None:
+    def send(returns: np.ndarray | None, lengths: np.ndarray | None, bias: dict[str, np.ndarray]) -> None:
         """What the state tells of the interval; nothing before the first step."""
         metrics = {name: np.asarray(value) for name, value in sweep.measure(state).items()} if done else {}
-        report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths))
+        report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths, bias))
 
     def save_here() -> None:
         if checkpoint_every:
@@ -172,6 +173,8 @@ def train_loop(
 
     evaluations = {step for step in evaluation_steps(train) if step > evaluated}
     checkpoints = set(checkpoint_steps(checkpoint_every, done, train.steps))
+    if checkpoint_every and evaluations:  # also where the last one alone is left
+        checkpoints.add(train.steps)
     for point in sorted(evaluations | checkpoints):
         while done < point and not stop():
             learn = done >= train.warmup_steps
@@ -188,7 +191,7 @@ def train_loop(
             interrupted = True
             save_here()
             if done > reported:
-                send(None, None)
+                send(None, None, {})
             break
         if point in evaluations:
             evaluate_and_report()

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -36,26 +36,40 @@ class Row:
 
 def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
     """Iterations per second of `run(iterations)` (median), and the seconds of the first call, which compiles."""
+    return measure_in_turns([run], seconds, repeats)[0]
 
-    def timed(iterations: int) -> float:
+
+def measure_in_turns(runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int) -> list[tuple[float, float]]:
+    """`measure` of each, one timed call of every one in turn: a machine that slows down does so for all of them."""
+
+    def timed(run: Callable[[int], Any], iterations: int) -> float:
         start = time.perf_counter()
         jax.block_until_ready(run(iterations))
         return time.perf_counter() - start
 
-    compile_seconds = timed(1)
-    iterations = 1
-    while (elapsed := timed(iterations)) < seconds / 4:
-        iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
-    iterations = max(1, round(iterations * seconds / elapsed))
-    return statistics.median(iterations / timed(iterations) for _ in range(repeats)), compile_seconds
+    compile_seconds = [timed(run, 1) for run in runs]
+    counts = []
+    for run in runs:
+        iterations = 1
+        while (elapsed := timed(run, iterations)) < seconds / 4:
+            iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
+        counts.append(max(1, round(iterations * seconds / elapsed)))
+    rates = [[count / timed(run, count) for run, count in zip(runs, counts, strict=True)] for _ in range(repeats)]
+    return list(zip(map(statistics.median, zip(*rates, strict=True)), compile_seconds, strict=True))
 
 
 def member_keys(members: int) -> Array:
     return jax.vmap(jax.random.key)(jnp.arange(members))
 
 
-def bench_env(task: str, members: int, physics: str, *, seconds: float, repeats: int, **options: Any) -> Row:
+def bench_env(task: str, members: int, physics: str, **timing: Any) -> Row:
     """Environment steps with random actions, automatic restarts included."""
+    rate, compile_seconds = measure(env_steps(task, members, physics), **timing)
+    return Row("env", f"{task}, {physics}", members, "env steps", rate * members, compile_seconds)
+
+
+def env_steps(task: str, members: int, physics: str, **options: Any) -> Callable[[int], Any]:
+    """A number of lockstep steps -> the environments after them."""
     env = envs.make(task, physics, **options)
 
     def step(timestep, key):
@@ -73,11 +87,10 @@ def bench_env(task: str, members: int, physics: str, *, seconds: float, repeats:
 
     keys = member_keys(members)
     start = jax.jit(jax.vmap(lambda key: rollout.reset(env, key, 1)))(keys)
-    rate, compile_seconds = measure(lambda steps: run(start, keys, steps), seconds, repeats)
-    return Row("env", f"{task}, {physics}", members, "env steps", rate * members, compile_seconds)
+    return lambda steps: run(start, keys, steps)
 
 
-def bench_bare(task: str, members: int, **timing: Any) -> Row:
+def bare_steps(task: str, members: int) -> Callable[[int], None]:
     """The same control steps by MuJoCo alone, without JAX and without restarts, on as many threads.
 
     `mujoco.rollout` gives no contact forces: for the humanoid, a thread pool makes the calls one robot at a time.
@@ -119,18 +132,18 @@ def bench_bare(task: str, members: int, **timing: Any) -> Row:
         for _ in range(steps):
             step()
 
-    rate, _ = measure(run, **timing)
-    return Row("physics", f"{task}, MuJoCo alone", members, "env steps", rate * members, 0.0)
+    return run
 
 
-def bench_physics(task: str, members: int, **timing: Any) -> Iterator[Row]:
-    """One task on each physics, beside MuJoCo alone and MJX with the model file's solver settings."""
-    yield bench_bare(task, members, **timing)
-    cases: dict[str, dict[str, Any]] = {name: {} for name in envs.PHYSICS}
-    cases["mjx, the file's iterations"] = {"iterations": None, "ls_iterations": None}
-    for what, options in cases.items():
-        row = bench_env(task, members, what.split(",")[0], **options, **timing)
-        yield dataclasses.replace(row, suite="physics", what=f"{task}, {what}")
+def bench_physics(task: str, members: int, solver: Mapping[str, dict[str, int]], **timing: Any) -> Iterator[Row]:
+    """One task on each physics, beside MuJoCo alone and MJX with the model file's and with other solver settings."""
+    runs = {"MuJoCo alone": bare_steps(task, members)}
+    runs |= {name: env_steps(task, members, name) for name in envs.PHYSICS if not envs.lacks(name)}
+    runs["mjx, the file's iterations"] = env_steps(task, members, "mjx", iterations=None, ls_iterations=None)
+    runs |= {f"mjx {limits}": env_steps(task, members, "mjx", **options) for limits, options in solver.items()}
+    rates = measure_in_turns(list(runs.values()), **timing)
+    for what, (rate, compile_seconds) in zip(runs, rates, strict=True):
+        yield Row("physics", f"{task}, {what}", members, "env steps", rate * members, compile_seconds)
 
 
 def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
@@ -209,8 +222,16 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
     return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
 
 
-def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) -> Row:
-    """The whole training loop: environment step, insert, sample, update."""
+def bench_loops(algo: str, task: str, members: int, physics: Sequence[str], **timing: Any) -> Iterator[Row]:
+    """The whole training loop, on each physics in turn: environment step, insert, sample, update."""
+    runs, compile_seconds = zip(*(loop_steps(algo, task, members, name) for name in physics), strict=True)
+    rates = measure_in_turns(runs, **timing)
+    for name, (rate, _), seconds in zip(physics, rates, compile_seconds, strict=True):
+        yield Row("loop", f"{algo} on {task}, {name}", members, "env steps", rate * members, seconds)
+
+
+def loop_steps(algo: str, task: str, members: int, physics: str) -> tuple[Callable[[int], Any], float]:
+    """A number of lockstep steps of training -> what it waits for; and the seconds of compilation."""
     config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
     sweep = train.make_sweep(algorithms.make_trainer(config))
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
@@ -220,10 +241,9 @@ def bench_loop(algo: str, task: str, members: int, physics: str, **timing: Any) 
     compile_seconds = time.perf_counter() - start
     state = sweep.advance(state, 299, False)
 
-    def once(steps):
+    def once(steps: int) -> Array:
         nonlocal state
         state = sweep.advance(state, steps, True)
         return state.env_steps
 
-    rate, _ = measure(once, **timing)
-    return Row("loop", f"{algo} on {task}, {physics}", members, "env steps", rate * members, compile_seconds)
+    return once, compile_seconds

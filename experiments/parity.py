@@ -2,7 +2,7 @@
 
 For each task and version: whole episodes on MuJoCo C against Gymnasium's own environment, single control steps of each
 physics from the same states, and the speed of five environments side by side. The benchmark's flags --tasks,
---physics, --seconds and --repeats are understood.
+--physics, --solver, --seconds and --repeats are understood.
 """
 
 import sys
@@ -16,9 +16,9 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments import runtime
-from experiments.bench import check_flags, machine
+from experiments.bench import check_flags, machine, physics_here, solver_limits
 from experiments.gymnasium_reference import Episode, episode, recorded
-from experiments.measure import bench_env
+from experiments.measure import env_steps, measure_in_turns
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 from sqt_jax.types import Environment
@@ -154,21 +154,31 @@ def report(episodes: dict[str, WholeEpisodes], steps: dict[tuple[str, str], tupl
     )
 
 
+def cases(simulators: Sequence[str]) -> dict[str, tuple[str, dict[str, int]]]:
+    """What a task is computed with: the row's name -> physics and its options."""
+    found: dict[str, tuple[str, dict[str, int]]] = {name: (name, {}) for name in simulators}
+    if "mjx" in simulators:
+        found |= {f"mjx {limits}": ("mjx", options) for limits, options in solver_limits().items()}
+    return found
+
+
 def main(argv: Sequence[str]) -> None:
     del argv  # what absl leaves of it: no flags
     check_flags()
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
+    rows = cases(physics_here())
     episodes: dict[str, WholeEpisodes] = {}
     steps: dict[tuple[str, str], tuple[Steps, float]] = {}
     for name in FLAGS.tasks:
-        for physics in FLAGS.physics:
-            print(f"{name} on {physics} ...", file=sys.stderr, flush=True)
-            env = envs.make(name, physics)
-            if physics == "mujoco":
-                episodes[name] = compare_episodes(env, [episode(name, *case) for case in EPISODES])
-            row = bench_env(name, MEMBERS, physics, seconds=FLAGS.seconds, repeats=FLAGS.repeats)
-            steps[name, physics] = compare_steps(name, env, FLAGS.states), row.rate
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        made = {row: envs.make(name, physics, **options) for row, (physics, options) in rows.items()}
+        if "mujoco" in made:
+            episodes[name] = compare_episodes(made["mujoco"], [episode(name, *case) for case in EPISODES])
+        runs = [env_steps(name, MEMBERS, physics, **options) for physics, options in rows.values()]
+        rates = measure_in_turns(runs, FLAGS.seconds, FLAGS.repeats)
+        for (row, env), (rate, _) in zip(made.items(), rates, strict=True):
+            steps[name, row] = compare_steps(name, env, FLAGS.states), rate * MEMBERS
     text = report(episodes, steps, " ".join(["python -m experiments.parity", *sys.argv[1:]]))
     print(text)
     if FLAGS.out:

@@ -13,7 +13,7 @@ from experiments import described, flags, records, resume
 from experiments.described import Described, Member
 from experiments.presets import preset_settings
 from sqt_jax import envs
-from sqt_jax.algorithms import make_config, memory_estimate
+from sqt_jax.algorithms import check_physics, make_config, memory_estimate
 from sqt_jax.config import Config, ConfigError, TrainConfig
 from sqt_jax.types import Environment
 
@@ -45,7 +45,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
 
     Raises `flags.UsageError` for settings that cannot be, a directory that is taken and too little memory.
     """
-    members, swept, path, run = _resumed(options) if options.resume else _named(options)
+    members, swept, path, run = _named(options) if options.resume in (None, flags.LATEST) else _resumed(options)
     if run is None:
         try:
             if options.overwrite:
@@ -83,6 +83,7 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
             make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
+        check_physics(configs[0])
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
         raise flags.UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None

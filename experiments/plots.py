@@ -1,75 +1,79 @@
-"""Pictures of a run, from its evaluations.csv."""
+"""Figures of finished runs: `python -m experiments.plots runs`.
 
-from collections.abc import Mapping
+Exit codes: 0 done; 2 bad usage (one line, nothing written).
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from experiments.records import groups, of_member, swept_columns
+from experiments import command_line
+from experiments.command_line import Parser, folder, guarded, one_of
 
-# Okabe and Ito's colours, which the colour-blind tell apart; black and yellow left out.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-LINES = ("-", "--", ":")
+EXAMPLE = "python -m experiments.plots RUNS... --out=figures"
+DESCRIPTION = """\
+Figures of finished runs: returns, the critics' disagreement and their bias over the environment steps, the score
+against penalty_coef, and performance profiles; each where there is something to show. Runs are pooled as in
+`python -m experiments.tables`."""
+FORMATS = ("png", "svg", "pdf")
+STATISTICS = ("iqm", "mean")
 
 
 def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None:
-    """Writes the return and the critics' disagreement over the environment steps as a PNG.
+    """Writes the curves of one run as a PNG: `figures.draw_curves`."""
+    from experiments import figures  # brings matplotlib
 
-    A colour per group: the mean over its members, a band of one population std, and a thin line per member.
-
-    Args:
-      table: the columns of evaluations.csv (`records.read_evaluations`).
-    """
-    # Without pyplot: no global state, no display.
-    figure = Figure(figsize=(11, 4.2), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, sharex=True)
-    names = swept_columns(table)
-    found = groups(table)
-    for axes, column in ((left, "return_mean"), (right, "q_std")):
-        for index, (values, members) in enumerate(found.items()):
-            colour, line = COLOURS[index % len(COLOURS)], LINES[index // len(COLOURS) % len(LINES)]
-            label = ", ".join(f"{name} {value:g}" for name, value in zip(names, values, strict=True))
-            seeds = f"{len(members)} seeds" if len(members) > 1 else "1 seed"
-            _draw_group(axes, table, members, column, colour, line, f"{label} ({seeds})")
-        if not np.isfinite(table[column]).any():
-            axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", color="0.4")
-            axes.set_yticks([])
-        axes.set_xlabel("environment steps per member")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.xaxis.set_major_locator(MaxNLocator(6))
-        axes.grid(alpha=0.25, linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.margins(x=0.01)
-    left.set_ylabel("return of an evaluation episode")
-    right.set_ylabel("std over critics, Q(s, a)")
-    left.legend(frameon=False, fontsize="small", loc="best")
-    figure.suptitle(f"{title}: mean and std over seeds, thin lines the seeds", fontsize="medium")
-    figure.savefig(path)
+    figures.draw_curves(table, path, title)
 
 
-def _draw_group(
-    axes: Axes,
-    table: Mapping[str, np.ndarray],
-    members: list[int],
-    column: str,
-    colour: str,
-    line: str,
-    label: str,
-) -> None:
-    curves = [of_member(table, member, column) for member in members]
-    count = min(map(len, curves))
-    values = np.stack([curve[:count] for curve in curves])
-    env_steps = of_member(table, members[0], "env_steps")[:count]
-    mean, std = values.mean(axis=0), values.std(axis=0)
-    # Where there is one point, or NaN around it, a line alone would show nothing.
-    marker = "o" if np.isfinite(mean).sum() < 30 else ""
-    if len(members) > 1:
-        for curve in values:
-            axes.plot(env_steps, curve, color=colour, linestyle=line, linewidth=0.6, alpha=0.45, zorder=2)
-        axes.fill_between(env_steps, mean - std, mean + std, color=colour, alpha=0.15, linewidth=0, zorder=1)
-    axes.plot(env_steps, mean, line, color=colour, linewidth=1.8, marker=marker, markersize=3.5, label=label, zorder=3)
+def parser() -> Parser:
+    made = Parser(DESCRIPTION, EXAMPLE)
+    made.add_argument("--out", type=folder, default=Path("figures"), metavar="FOLDER", help="where they go (figures)")
+    made.add_argument(
+        "--format", type=one_of(*FORMATS), default="png", metavar="NAME", help=f"one of {', '.join(FORMATS)} (png)"
+    )
+    made.add_argument(
+        "--statistic", type=one_of(*STATISTICS), default="iqm", metavar="NAME", help="over seeds: iqm or mean (iqm)"
+    )
+    made.add_argument("--overwrite", action="store_true", help="replace figures that are there")
+    return made
+
+
+def command(argv: Sequence[str]) -> None:
+    options = parser().read(argv)
+    from experiments import collected, figures  # these and what they bring take a second or two
+
+    runs = collected.collect(options.runs)
+    biases = [column for group in runs.groups for column in group.columns("value_bias")]
+    columns = dict.fromkeys(["return_mean", "q_std", *biases])
+    draw = {
+        {"return_mean": "learning_curves"}.get(column, column): partial(
+            figures.over_time, runs, column, options.statistic
+        )
+        for column in columns
+    }
+    draw |= {"penalty_sweep": partial(figures.penalty_sweep, runs, options.statistic)}
+    draw |= {"performance_profile": partial(figures.performance_profile, runs)}
+    command_line.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
+    drawn = {name: function() for name, function in draw.items()}
+    contents = {
+        f"{name}.{options.format}": figures.image(figure, options.format) for name, figure in drawn.items() if figure
+    }
+    command_line.write_files(options.out, contents)
+    for name in contents:
+        print(options.out / name)
+    empty = [name for name, figure in drawn.items() if figure is None]
+    for text in [*([f"nothing to draw: {', '.join(empty)}"] if empty else []), *runs.notes]:
+        print(text, file=sys.stderr)
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command line `argv`, program name first; gives the exit code."""
+    return guarded(command, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv))

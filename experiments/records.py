@@ -1,21 +1,23 @@
 """What a run leaves in `<out>/<env>/<algo>/<name>/`: tables, a summary, events for TensorBoard."""
 
+import contextlib
 import csv
 import json
 import math
-import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy import stats
-from tensorboardX import SummaryWriter
 
 from experiments import files
+from experiments.csv_table import Shortened, Table
 from experiments.described import Member
+from experiments.events import Events
 from experiments.loop import Outcome, Report
+from experiments.statistics import iqm, score
+from sqt_jax import bias
 
 # The columns that every evaluations.csv has; further swept scalars follow.
 EVALUATION_COLUMNS = (
@@ -34,29 +36,8 @@ EVALUATION_COLUMNS = (
 )
 
 
-class Score(NamedTuple):
-    """The paper's "maximum average reward": the best evaluation of the mean over seeds."""
-
-    mean: float
-    std: float  # population std over the seeds, at that evaluation
-    evaluation: int  # which one it is
-
-
-def score(returns: np.ndarray) -> Score | None:
-    """Score of `returns` [seeds, evaluations]; evaluations with a NaN do not count. None if there is no other."""
-    mean = returns.mean(axis=0)
-    if not np.isfinite(mean).any():
-        return None
-    best = int(np.nanargmax(np.where(np.isfinite(mean), mean, np.nan)))
-    return Score(float(mean[best]), float(returns[:, best].std()), best)
-
-
 class RunExists(Exception):
     """The run directory already holds a run."""
-
-
-class Shortened(Exception):
-    """A table holds less than a checkpoint says; its name."""
 
 
 class NotARun(Exception):
@@ -73,7 +54,7 @@ RUN_FILES = (
     "summary.json.part",
     "curves.png",
 )
-RUN_FOLDERS = ("checkpoint", "policy", "tensorboard")
+RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "tensorboard")
 # What a run that died before it began may have left.
 LEFTOVERS = {"lock", "config.json.part"}
 
@@ -90,10 +71,12 @@ def run_alone(path: Path) -> set[str]:
       NotARun: what is there is not a run alone: there is no config.json, there are other files, or links.
       OSError: it is no folder, or cannot be read.
     """
-    if not path.exists() and not path.is_symlink():
+    if path.is_symlink():
+        raise NotARun
+    if not path.exists():
         return set()
     names = {item.name for item in path.iterdir()} - {"lock"}
-    links = path.is_symlink() or any(item.is_symlink() for item in path.rglob("*"))
+    links = any(item.is_symlink() for item in path.rglob("*"))
     if links or (names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS})):
         raise NotARun
     return names
@@ -110,7 +93,8 @@ def remove_run(path: Path) -> None:
     names = run_alone(path)
     for name in names & {*RUN_FOLDERS}:
         shutil.rmtree(path / name)
-    for name in names & {*RUN_FILES}:
+    # The one that says that this is a run goes last: what is half removed can be removed, or gone on with.
+    for name in sorted(names & {*RUN_FILES}, key=lambda name: name == "config.json"):
         (path / name).unlink()
 
 
@@ -135,35 +119,31 @@ class Records:
         swept: Sequence[str],
         tensorboard: bool = True,
         resumed_at: tuple[int, Mapping[str, int]] | None = None,
+        warn: Callable[[str], None] = lambda line: None,
     ):
         path.mkdir(parents=True, exist_ok=True)
-        if resumed_at is None and is_taken(path):
+        if resumed_at is None and (path / "evaluations.csv").exists():
             raise RunExists
         env_steps, lengths = resumed_at or (None, {})
         for table in ("evaluations", "metrics"):  # before one of them is cut
             file = path / f"{table}.csv"
             if lengths.get(table, 0) > (file.stat().st_size if file.is_file() else 0):
                 raise Shortened(file.name)
-        self.path, self.members = path, members
+        self.path, self.members, self.warn = path, members, warn
         self.swept = [name for name in swept if name != "penalty_coef"]
-        self._evaluations = _Table(
-            path / "evaluations.csv", lengths.get("evaluations", 0), [*EVALUATION_COLUMNS, *self.swept]
-        )
+        columns = [*EVALUATION_COLUMNS, *self.swept]
+        self._evaluations = Table(path / "evaluations.csv", lengths.get("evaluations", 0), columns)
         # Its columns are known with the first metrics.
-        self._metrics: _Table | None = None
-        if lengths.get("metrics", 0):
-            self._metrics = _Table(path / "metrics.csv", lengths["metrics"])
-        else:
+        self._metrics: Table | None = None
+        self._keep_metrics = lengths.get("metrics", 0)
+        if not self._keep_metrics:
             (path / "metrics.csv").unlink(missing_ok=True)
         purge_step = None if env_steps is None else env_steps + 1  # events from there on do not count
-        self._events = (
-            [
-                SummaryWriter(str(path / "tensorboard" / _label(member, self.swept)), purge_step=purge_step)
-                for member in members
-            ]
-            if tensorboard
-            else []
-        )
+        self._events: list[Events] = []
+        if tensorboard:
+            labels = [_label(member, self.swept) for member in members]
+            self._events = [Events(path / "tensorboard" / label, purge_step) for label in labels]
+        self._room = True
 
     def __enter__(self) -> "Records":
         return self
@@ -172,21 +152,34 @@ class Records:
         self._evaluations.close()
         if self._metrics:
             self._metrics.close()
-        for writer in self._events:
-            writer.close()
+        with contextlib.suppress(OSError):
+            for events in self._events:
+                events.close()
 
     def lengths(self) -> dict[str, int]:
-        """Bytes of the tables, which are on disk by then."""
-        return {"evaluations": self._evaluations.length(), "metrics": self._metrics.length() if self._metrics else 0}
+        """Bytes of the tables, which are on disk by then.
+
+        Raises:
+          OSError: there is no room for them.
+        """
+        metrics = self._metrics.length() if self._metrics else self._keep_metrics
+        return {"evaluations": self._evaluations.length(), "metrics": metrics}
 
     def report(self, report: Report) -> None:
-        """A row per member in evaluations.csv where there was an evaluation, in metrics.csv where there were steps."""
+        """A row per member in evaluations.csv where there was an evaluation, in metrics.csv where there were steps.
+
+        A full disk is told to `warn`, once: the rows wait, and TensorBoard's events end.
+        """
         if report.metrics and self._metrics is None:
             columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *report.metrics]
+            columns += bias.NAMES
             # SAC's temperature is a metric too, and says the same where it is swept.
-            self._metrics = _Table(self.path / "metrics.csv", 0, [*dict.fromkeys(columns), "wall_seconds"])
+            columns = [*dict.fromkeys(columns), "wall_seconds"]
+            self._metrics = Table(self.path / "metrics.csv", self._keep_metrics, columns)
+        room = True
         for index, member in enumerate(self.members):
             metrics = {name: float(values[index]) for name, values in report.metrics.items()}
+            judged = {name: float(values[index]) for name, values in report.bias.items()}
             row: dict[str, Any] = {
                 "member": index,
                 "env_steps": report.env_steps,
@@ -204,16 +197,21 @@ class Records:
                     "episode_length_mean": float(report.lengths[index].mean()),
                 }
                 measured = {name: metrics.get(name, math.nan) for name in ("q_mean", "q_std")}
-                self._evaluations.write(row | evaluation | measured)
+                evaluation["value_bias"] = judged.get("value_bias", math.nan)
+                room &= self._evaluations.write(row | evaluation | measured)
             if self._metrics and report.metrics:
-                self._metrics.write(row | metrics)
+                room &= self._metrics.write(row | metrics | judged)
             if self._events:
                 values = {f"eval/{name}": value for name, value in evaluation.items()}
                 values |= {f"train/{name}": value for name, value in metrics.items()}
-                for name, value in values.items():
-                    if not math.isnan(value):
-                        self._events[index].add_scalar(name, value, report.env_steps)
-                self._events[index].flush()
+                try:
+                    self._events[index].add({n: v for n, v in values.items() if not math.isnan(v)}, report.env_steps)
+                except OSError as error:
+                    self._events = []
+                    self.warn(f"no more events for TensorBoard: {error.strerror}")
+        if self._room and not room:
+            self.warn("there is no room for rows of evaluations.csv and metrics.csv: they wait until there is")
+        self._room = room
 
     def summary(self, outcome: Outcome) -> dict[str, Any]:
         """Writes summary.json and gives what is in it."""
@@ -230,43 +228,6 @@ class Records:
         with files.whole_file(self.path / "summary.json") as file:
             file.write((json.dumps(_without_nan(summary), indent=2, allow_nan=False) + "\n").encode())
         return summary
-
-
-class _Table:
-    """A CSV file that outlives the process row by row.
-
-    Of a file that exists, the first `keep` bytes stay; its columns are then its own.
-
-    Raises:
-      Shortened: it has fewer.
-    """
-
-    def __init__(self, path: Path, keep: int, columns: Sequence[str] = ()):
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        self._file = os.fdopen(descriptor, "r+", newline="")
-        if os.fstat(descriptor).st_size < keep:
-            self._file.close()
-            raise Shortened(path.name)
-        if keep:
-            columns = next(csv.reader([self._file.readline()]))
-        os.ftruncate(descriptor, keep)
-        self._file.seek(keep)
-        self._writer = csv.DictWriter(self._file, columns, restval="", lineterminator="\n")
-        if not keep:
-            self._writer.writeheader()
-        self._file.flush()
-
-    def length(self) -> int:
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        return os.fstat(self._file.fileno()).st_size
-
-    def write(self, row: Mapping[str, Any]) -> None:
-        self._writer.writerow({name: "" if value != value else value for name, value in row.items()})
-        self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
 
 
 def read_evaluations(path: Path) -> dict[str, np.ndarray]:
@@ -322,7 +283,7 @@ def summarise(table: Mapping[str, np.ndarray]) -> dict[str, Any]:
                 "final": {
                     "mean": float(final.mean()),
                     "std": float(final.std()),
-                    "iqm": float(stats.trim_mean(final, 0.25)),
+                    "iqm": float(iqm(final)),
                 },
             }
         )

@@ -8,6 +8,8 @@ from typing import Any
 from experiments import described, records
 from experiments.described import Described, Member
 from experiments.flags import UsageError
+from sqt_jax.algorithms import check_physics
+from sqt_jax.config import ConfigError, check_train
 
 # What may differ from one process of a run to the next: more steps, and what does not change what is trained.
 NOT_COMPARED = {"steps"}
@@ -33,7 +35,13 @@ def named(path: Path, wanted: Mapping[str, Any]) -> Described:
     if refusal:
         raise UsageError(f"--resume={path}: {refusal}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
-    return run._replace(members=[_with_train(member, steps=steps) for member in run.members])
+    members = [_with_train(member, steps=steps) for member in run.members]
+    try:
+        check_train(members[0].config.train)
+        check_physics(members[0].config)
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
+    return run._replace(members=members)
 
 
 def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:

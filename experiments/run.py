@@ -1,6 +1,7 @@
 """Train one sweep and record it: `python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4`.
 
-Exit codes: 0 done; 2 bad usage (one line, nothing written); 3 a member diverged; 130 interrupted.
+Exit codes: 0 done; 1 the results could not be written; 2 bad usage (one line, nothing written); 3 a member diverged;
+130 interrupted.
 """
 
 import os
@@ -10,6 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -19,19 +21,20 @@ from rich.console import Console
 
 from experiments import flags, progress, runtime
 from experiments.loop import BEGINNING, Outcome, Position, train_loop
-from sqt_jax.algorithms import make_trainer, replay_of
+from sqt_jax.algorithms import agent_of, make_trainer, replay_of
 from sqt_jax.policy import save_policy
 from sqt_jax.train import Sweep, TrainState, evaluation_steps, make_sweep
 from sqt_jax.types import Array, Environment, Scalars
 
-# `plan`, `records` and `plots` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are
+# `plan`, `records` and `figures` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are
 # imported where they are used, so that a typing error is answered in a second.
 if TYPE_CHECKING:
     from experiments.checkpoints import Checkpoints, Restored
+    from experiments.described import Described
     from experiments.plan import Plan
     from experiments.records import Records
 
-DONE, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 2, 3, 130
+DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 def run(plan: "Plan", command: Sequence[str]) -> int:
@@ -47,14 +50,25 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
         template = jax.eval_shape(sweep.init, *_start(plan))
         folder, replay = plan.path / "checkpoint", replay_of(plan.config, plan.env)
         store = checkpoints.Checkpoints(folder, replay, plan.output["keep_checkpoints"], display.message)
-        restored = store.restore(template) if plan.resumed else None
-        tables = stack.enter_context(_tables(plan, restored))
-        _describe(plan, restored, command)
+        stack.callback(store.wait)
+        restored = _restored(plan, store, template)
+        # A new folder is a run, which can be gone on with, before it is anything else; an old one stays as it is until
+        # it is known that it can be gone on with.
+        if not plan.resumed:
+            _claim(plan, command)
+        tables = stack.enter_context(_tables(plan, restored, display.message))
+        if plan.resumed:
+            _go_on(plan, plan.resumed, restored, command)
+            store.remove_others()
         if not plan.options.quiet:
             _announce(console, plan, restored, store.sizes(template))
         outcome = _train(plan, sweep, restored, tables, store, display, lambda: bool(stop))
-        summary = tables.summary(outcome)
-        curves = _results(plan, outcome)
+        try:
+            summary = tables.summary(outcome)
+            curves = _results(plan, outcome)
+        except OSError as error:
+            display.message(f"the results cannot be written: {error}")
+            return FAILED
 
     if not plan.options.quiet:
         console.print(progress.final_table(summary, tables.swept))
@@ -96,40 +110,77 @@ def _start(plan: "Plan") -> tuple[Array, Scalars]:
     return jax.vmap(jax.random.key)(seeds), Scalars(*scalars)
 
 
-def _tables(plan: "Plan", restored: "Restored | None") -> "Records":
+def _restored(plan: "Plan", store: "Checkpoints", template: TrainState) -> "Restored | None":
+    """Where the resumed run goes on; None is from the start."""
+    from experiments import manifests
+
+    if not plan.resumed:
+        return None
+    try:
+        restored = store.restore(template)
+    except manifests.Refused as error:
+        raise flags.UsageError(f"--resume={plan.path}: takes a run with checkpoints to go on from; {error}") from None
+    # A run that died before its first checkpoint has lost nothing that it would not write again.
+    if restored is None and (plan.resumed.content["output"].get("checkpoint_every") == 0 or _summary(plan).exists()):
+        raise flags.UsageError(f"--resume={plan.path}: takes a run with checkpoints to go on from; it has none")
+    return restored
+
+
+def _summary(plan: "Plan") -> Path:
+    return plan.path / "summary.json"
+
+
+def _claim(plan: "Plan", command: Sequence[str]) -> None:
+    """Makes the folder a run: writes config.json into it, where nothing else is or what is there may be replaced."""
+    from experiments import described, records
+    from experiments.plan import taken
+
+    try:
+        if plan.options.overwrite:
+            records.remove_run(plan.path)
+        if records.is_taken(plan.path):
+            raise flags.UsageError(taken(plan.path))
+        content = described.describe(plan.members, plan.swept, command, plan.options.preset, plan.output)
+        described.write(plan.path, content)
+    except records.NotARun:
+        raise flags.UsageError(
+            f"--overwrite: {plan.path} holds other things than a run; takes a folder with a run alone"
+        ) from None
+    except OSError as error:
+        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
+
+
+def _go_on(plan: "Plan", run: "Described", restored: "Restored | None", command: Sequence[str]) -> None:
+    """Says in config.json that the run goes on, and removes what told of its end."""
+    from experiments import described
+
+    at = restored.position.env_steps if restored else 0
+    try:
+        described.write(plan.path, described.resumed(run.content, plan.train.steps, plan.output, at, command))
+        _summary(plan).unlink(missing_ok=True)
+    except OSError as error:
+        raise flags.UsageError(f"--resume={plan.path}: takes a folder that can be written: {error}") from None
+
+
+def _tables(plan: "Plan", restored: "Restored | None", warn: Callable[[str], None]) -> "Records":
     """The run's tables: new ones, or those of the resumed run as they were at its checkpoint."""
-    from experiments import records
-    from experiments.plan import not_a_run, taken
+    from experiments import csv_table, records
 
     resumed_at = None
     if plan.resumed:
         resumed_at = (restored.position.env_steps, restored.lengths) if restored else (-1, {})
     try:
-        if plan.options.overwrite:
-            records.remove_run(plan.path)
-        return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at)
-    except records.NotARun:
-        raise flags.UsageError(not_a_run(plan.path)) from None
-    except records.RunExists:
-        raise flags.UsageError(taken(plan.path)) from None
-    except records.Shortened as error:
+        return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, warn)
+    except csv_table.Shortened as error:
         raise flags.UsageError(
             f"--resume={plan.path}: {error} has lost rows since the checkpoint; takes a run with whole tables"
         ) from None
+    except csv_table.OtherColumns as error:
+        raise flags.UsageError(
+            f"--resume={plan.path}: takes a run of this version; {error} has other columns"
+        ) from None
     except OSError as error:
-        raise _cannot_write(plan, error) from None
-
-
-def _describe(plan: "Plan", restored: "Restored | None", command: Sequence[str]) -> None:
-    """Writes config.json."""
-    from experiments import described
-
-    if plan.resumed:
-        at = restored.position.env_steps if restored else 0
-        content = described.resumed(plan.resumed.content, plan.train.steps, at, command)
-    else:
-        content = described.describe(plan.members, plan.swept, command, plan.options.preset, plan.output)
-    described.write(plan.path, content)
+        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
 
 
 def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes: tuple[int, int]) -> None:
@@ -146,8 +197,10 @@ def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes
         say(f"going on with it {at}")
         if others := resume.other_versions(plan.resumed):
             say(f"other versions than when it began, so that it may go on differently: {', '.join(others)}")
+    # The policy whose values are judged is played beside the deterministic one, where it is another.
+    episodes = train.eval_episodes * (2 if agent_of(plan.config, plan.env).valued_act else 1)
     evaluations = len(evaluation_steps(train))
-    say(progress.evaluation_share(train.steps, evaluations, train.eval_episodes, plan.env.episode_length))
+    say(progress.evaluation_share(train.steps, evaluations, episodes, plan.env.episode_length))
     if every := plan.output["checkpoint_every"]:
         state, row = sizes
         say(
@@ -166,7 +219,12 @@ def _train(
     stop: Callable[[], bool],
 ) -> Outcome:
     def save(state: TrainState, position: Position) -> None:
-        store.save(state, position, tables.lengths())
+        try:
+            lengths = tables.lengths()
+        except OSError as error:
+            display.message(f"no checkpoint at step {position.env_steps:,} ({error.strerror}), and the run goes on")
+            return
+        store.save(state, position, lengths)
 
     outcome = train_loop(
         sweep,
@@ -186,14 +244,17 @@ def _train(
 
 def _results(plan: "Plan", outcome: Outcome) -> bool:
     """Writes the policies and, where there are evaluations, the curves; whether there are."""
-    from experiments import plots, records
+    from experiments import figures, records
 
-    shutil.rmtree(plan.path / "policy", ignore_errors=True)  # of the process that this one continues
-    save_policy(plan.path / "policy", plan.config, plan.env, outcome.state.agent)
+    policy, part = plan.path / "policy", plan.path / "policy.part"
+    shutil.rmtree(part, ignore_errors=True)
+    save_policy(part, plan.config, plan.env, outcome.state.agent)
+    shutil.rmtree(policy, ignore_errors=True)  # of the process that this one continues
+    part.rename(policy)
     table = records.read_evaluations(plan.path / "evaluations.csv")
     if not len(table["member"]):
         return False
-    plots.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+    figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
     return True
 
 

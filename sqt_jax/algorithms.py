@@ -157,6 +157,17 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     return Config(algo, env, physics, eval_physics, agent, train_config)
 
 
+def check_physics(config: Config) -> None:
+    """Raises ConfigError where this machine lacks what the physics of the training or of the evaluation need.
+
+    Not part of `make_config`: a policy that was trained elsewhere has settings too.
+    """
+    for setting, physics in {"physics": config.physics, "eval_physics": eval_physics_of(config)}.items():
+        if missing := envs.lacks(physics):
+            here = ", ".join(name for name in envs.simulators(config.env) if not envs.lacks(name))
+            raise ConfigError(setting, f"{physics} needs {missing}; takes one of {here} here")
+
+
 def make_agent(algo: str, observation_size: int, action_size: int, **settings: Any) -> Agent:
     """An algorithm's `init`, `act` and `update` alone, for a loop and an environment of your own.
 

@@ -155,6 +155,8 @@ LIMITS: dict[str, tuple[float, float, str]] = {
 }
 
 
+# What the device holds: int32, float32.
+LARGEST_INTEGER, LARGEST_NUMBER = 2**31 - 1, 3.4e38
 MAX_LAYERS = 32
 
 
@@ -169,16 +171,20 @@ def check_value(setting: str, value: Any) -> None:
         raise ConfigError(setting, f"takes one of {', '.join(CHOICES[setting])}, not {value!r}")
     if setting in LIMITS:
         low, high, takes = LIMITS[setting]
-        # Whole numbers are int32 on the device, the others float32.
-        kinds, largest = ((int,), 2**31 - 1) if "whole" in takes else ((int, float), 3.4e38)
+        kinds, largest = ((int,), LARGEST_INTEGER) if "whole" in takes else ((int, float), LARGEST_NUMBER)
         if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= min(high, largest):
+            if isinstance(value, kinds) and value > largest and high == math.inf:
+                takes = f"{takes} and at most {largest}"
             raise ConfigError(setting, f"takes {takes}, not {value!r}")
     if setting in SWITCHES and not isinstance(value, bool):
         raise ConfigError(setting, f"takes true or false, not {value!r}")
     if setting == "hidden" and not (
-        isinstance(value, (tuple, list)) and 1 <= len(value) <= MAX_LAYERS and all(type(w) is int and 1 <= w <= 65536 for w in value)
+        isinstance(value, (tuple, list))
+        and 1 <= len(value) <= MAX_LAYERS
+        and all(type(w) is int and 1 <= w <= 65536 for w in value)
     ):
-        raise ConfigError(setting, f"takes layer widths, whole numbers from 1 to 65536 as in 256,256, not {_brief(value)}")
+        takes = f"layer widths, up to {MAX_LAYERS} whole numbers from 1 to 65536 as in 256,256"
+        raise ConfigError(setting, f"takes {takes}, not {_brief(value)}")
 
 
 def _refuse(wrong: bool, setting: str, message: str) -> None:

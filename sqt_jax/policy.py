@@ -7,6 +7,8 @@ policy/act.stablehlo   the function (arrays of a member, obs [B, O]) -> action [
 """
 
 import json
+import math
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,9 @@ from sqt_jax.algorithms import ALGORITHMS, agent_of, make_config
 from sqt_jax.config import Config
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Agent, Array, Environment, State
+
+MAX_CONFIG_BYTES = 1_000_000
+MAX_SIZE = 1_000_000  # of an observation or an action
 
 
 def save_policy(directory: Path | str, config: Config, env: Environment, agent_state: State) -> None:
@@ -44,26 +49,76 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
 
     Raises:
       FileNotFoundError: there is no such policy or member.
-      ValueError: the parameters are not those of the stated algorithm and sizes.
+      ValueError: a file is damaged, or the parameters are not those of the stated algorithm and sizes.
     """
     directory = Path(directory)
-    settings = json.loads((directory / "config.json").read_text())
-    sizes = settings.pop("observation_size"), settings.pop("action_size")
-    config = make_config(**settings)
+    config, sizes = _read_config(directory / "config.json")
     agent = ALGORITHMS[config.algo].make_agent(config.agent, *sizes)
     expected = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
-    shapes = {name: leaf.shape for name, leaf in by_path(expected).items()}
-    with np.load(directory / f"member_{member}.npz", allow_pickle=False) as file:
-        arrays = {name: jnp.asarray(file[name]) for name in file.files}
-    if {name: array.shape for name, array in arrays.items()} != shapes:
+    arrays = _read_arrays(directory / f"member_{member}.npz", by_path(expected))
+    if arrays is None:
         raise ValueError(f"{directory}: member {member} does not hold a policy of {config.algo} for sizes {sizes}")
-    params = from_paths(expected, arrays)
+    params = from_paths(expected, {name: jnp.asarray(array) for name, array in arrays.items()})
 
     @jax.jit
     def policy(obs: Array) -> Array:
         return agent.policy_action(params, jnp.asarray(obs, jnp.float32))
 
     return policy
+
+
+def _read_config(path: Path) -> tuple[Config, tuple[int, int]]:
+    """Settings, and the sizes of observations and actions."""
+    try:
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: there is no such file")
+        with path.open("rb") as file:
+            content = file.read(MAX_CONFIG_BYTES + 1)
+        if len(content) > MAX_CONFIG_BYTES:
+            raise ValueError(f"more than {MAX_CONFIG_BYTES:,} bytes")
+        settings = json.loads(content)
+        sizes = settings.pop("observation_size"), settings.pop("action_size")
+        if not all(type(size) is int and 1 <= size <= MAX_SIZE for size in sizes):
+            raise ValueError(f"sizes are whole numbers from 1 to {MAX_SIZE}")
+        return make_config(**settings), sizes
+    except FileNotFoundError:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError, OSError) as error:
+        raise ValueError(f"{path}: not the settings of a policy: {_one_line(error)}") from None
+
+
+def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] | None:
+    """The arrays of an .npz file; None where they are not of the expected names, shapes and types.
+
+    What a file says of its sizes is compared before anything of that size is read.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sorted(archive.namelist()) != sorted(f"{name}.npy" for name in expected):
+                return None
+            arrays = {}
+            for name, leaf in expected.items():
+                with archive.open(f"{name}.npy") as file:
+                    version = np.lib.format.read_magic(file)
+                    if version != (1, 0):
+                        raise ValueError(f"arrays of version {version}")
+                    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
+                    if (shape, dtype) != (leaf.shape, leaf.dtype):
+                        return None
+                    size = math.prod(shape) * dtype.itemsize
+                    data = file.read(size + 1)
+                    if len(data) != size:
+                        raise ValueError(f"{name} is truncated or too long")
+                    arrays[name] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
+            return arrays
+    except Exception as error:  # whatever zipfile and NumPy say of a file that is not theirs
+        raise ValueError(f"{path}: not the parameters of a policy: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
 def _exported(agent: Agent, observation_size: int) -> bytes:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from sqt_jax import rollout
 from sqt_jax.config import TrainConfig
-from sqt_jax.evaluate import Evaluation, evaluate
+from sqt_jax.evaluate import Evaluation, evaluate_and_judge
 from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep
 
 # Leaves that are equal in all members, which advance in lockstep.
@@ -62,7 +62,7 @@ class Trainer(NamedTuple):
 
     init: Callable[..., TrainState]  # (key, scalars=None) -> state
     advance: Callable[[TrainState, Any, Any], TrainState]  # (state, num_steps, learn)
-    evaluate: Callable[[TrainState], Evaluation]
+    evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]  # and the bias of the critics' values
     measure: Callable[[TrainState], Metrics]  # what is worth reporting of the interval, and of the state at its end
 
 
@@ -71,7 +71,7 @@ class Sweep(NamedTuple):
 
     init: Callable[[Array, Scalars], TrainState]  # (keys [S], scalars of [S] each)
     advance: Callable[[TrainState, int, bool], TrainState]  # donates the state
-    evaluate: Callable[[TrainState], Evaluation]
+    evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]
     measure: Callable[[TrainState], Metrics]
 
 
@@ -156,14 +156,27 @@ def make_trainer(
         learn = jnp.asarray(learn)
         return jax.lax.fori_loop(0, num_steps, lambda _, state: step(state, learn), state)
 
-    def evaluate_policy(state: TrainState) -> Evaluation:
-        """Deterministic episodes from starts that training never saw, new ones at each evaluation."""
-        key = key_for(EVALUATION, state)
+    def evaluate_policy(state: TrainState) -> tuple[Evaluation, Metrics]:
+        """Deterministic episodes from starts that training never saw, new ones at each evaluation.
 
-        def policy(obs):
-            return agent.act(state.agent, obs, key, deterministic=True)
+        The critics are judged on them, and where they estimate the values of another policy, on as many of its own.
+        """
+        key, count = key_for(EVALUATION, state), config.eval_episodes
 
-        return evaluate(eval_env or env, policy, key, config.eval_episodes)
+        def policy(obs, key):
+            action = agent.act(state.agent, obs[:count], key, deterministic=True)
+            if not agent.valued_act:
+                return action, jnp.zeros(count)
+            own, bonus = agent.valued_act(state.agent, obs[count:], key)
+            return jnp.concatenate([action, own]), jnp.concatenate([jnp.zeros(count), bonus])
+
+        def critics(obs, action):
+            return agent.q_values(state.agent, obs, action)
+
+        episodes = 2 * count if agent.valued_act else count
+        gamma = state.agent.scalars.gamma
+        played, bias = evaluate_and_judge(eval_env or env, policy, critics, gamma, key, episodes, judged=count)
+        return jax.tree.map(lambda x: x[:count], played), bias
 
     def measure(state: TrainState) -> Metrics:
         """Means since `new_interval` (NaN where nothing was measured), and the status of agent and environments."""
@@ -241,7 +254,8 @@ def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[Tra
 
         def interval(state, count):
             state, _ = jax.lax.scan(phase, new_interval(state), (count, jnp.array([False, True])))
-            return state, (state.env_steps, trainer.evaluate(state), trainer.measure(state))
+            evaluation, bias = trainer.evaluate(state)
+            return state, (state.env_steps, evaluation, trainer.measure(state) | bias)
 
         start = trainer.init(key, scalars)
         state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, start, jnp.array(counts))

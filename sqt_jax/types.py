@@ -78,6 +78,10 @@ class Agent(NamedTuple):
     td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]  # (state, batch, noise) -> [B], terms
     policy: Callable[[State], Params]  # state -> what deterministic acting needs of it
     policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
+    q_values: Callable[[State, Array, Array], Array]  # (state, obs [B, O], action [B, A]) -> [N, B], the critics
+    # The policy whose values the critics estimate, where that is not the deterministic one: (state, obs [B, O], key) ->
+    # action [B, A] and its entropy bonus [B].
+    valued_act: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
     observe: Callable[[State, Array, Array], State] = lambda state, episode_return, ended: state  # [E], [E] bool
     status: Callable[[State], Metrics] = lambda state: {}  # what is worth reporting of a state
 

@@ -65,3 +65,17 @@ def with_a_field_called_size() -> Environment:
         return state, state.size[None], state.size, jnp.zeros((), bool)
 
     return make_environment("sized", 1, 1, 5, start, advance)
+
+
+def diverging() -> Environment:
+    """An action above 0 makes an observation that is not a number, and an infinite reward; others earn 1."""
+
+    def start(key):
+        obs = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
+        return obs, obs
+
+    def advance(state, action):
+        broken = action[0] > 0
+        return state, jnp.where(broken, jnp.nan, state), jnp.where(broken, jnp.inf, 1.0), jnp.zeros((), bool)
+
+    return make_environment("diverging", 1, 1, 10, start, advance)

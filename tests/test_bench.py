@@ -7,14 +7,18 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench
+from sqt_jax.envs import physics
 
 
 def test_ratios_are_those_of_one_task_and_number_of_members():
     rates = {"MuJoCo alone": 100.0, "mujoco": 90.0, "mjx": 50.0, "mjx, the file's iterations": 20.0}
     rows = [bench.Row("physics", f"ant, {what}", 5, "env steps", rate, 0.0) for what, rate in rates.items()]
+    loops = {"td3 on ant, mjx": 200.0, "td3 on ant, mujoco": 250.0, "td3 on walker, mujoco": 300.0}
+    rows += [bench.Row("loop", what, 5, "env steps", rate, 0.0) for what, rate in loops.items()]
     assert bench.ratios(rows) == [
         "ant, 5 members: mujoco / MuJoCo alone = 0.90",
         "ant, 5 members: mjx / mjx, the file's iterations = 2.50",
+        "td3 on ant, 5 members: mujoco / mjx = 1.25",
     ]
 
 
@@ -22,7 +26,7 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
     found = [
         bench.Row("env", task, members, "env steps", 1234.5, 6.78) for task in ("ant", "walker") for members in (1, 5)
     ]
-    monkeypatch.setattr(bench, "rows", lambda suites, **timing: found)
+    monkeypatch.setattr(bench, "rows", lambda suites, physics, **timing: found)
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
     cached = jax.config.jax_enable_compilation_cache
     try:
@@ -44,6 +48,8 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
         ("tasks", "hopper2"),
         ("algos", "td8"),
         ("physics", "x"),
+        ("solver", "8"),
+        ("solver", "8/0"),
         ("members", "0"),
         ("capacities", "x"),
     ],
@@ -54,3 +60,19 @@ def test_a_wrong_name_is_told_in_one_line_before_anything_runs(flag, value):
         bench.main(["bench"])
     message = str(error.value)
     assert message.startswith(f"--{flag}: takes ") and value in message and "\n" not in message
+
+
+def test_physics_that_cannot_run_here_are_left_out_or_refused(monkeypatch):
+    monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
+    bench.FLAGS.mark_as_parsed()
+    assert bench.physics_here() == ["mjx", "mujoco"]
+    with flagsaver.flagsaver(physics=["warp"]), pytest.raises(SystemExit, match="^--physics: warp needs a part$"):
+        bench.physics_here()
+
+
+def test_limits_of_the_solver_are_pairs():
+    bench.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(solver=["100/50", "8/3"]):
+        first, second = bench.solver_limits().items()
+    assert first == ("100/50", {"iterations": 100, "ls_iterations": 50})
+    assert second == ("8/3", {"iterations": 8, "ls_iterations": 3})

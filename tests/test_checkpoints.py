@@ -10,9 +10,11 @@ import probe_envs
 import pytest
 from test_train import identical, make, start
 
-from experiments import checkpoints, files
+from experiments import checkpoints, files, manifests
 from experiments.checkpoints import Checkpoints
 from experiments.loop import Position
+from experiments.manifests import Refused
+from sqt_jax import train
 from sqt_jax.algorithms import ALGORITHMS, replay_of
 
 SEEDS = (0, 1, 2)
@@ -23,15 +25,18 @@ LENGTHS = {"evaluations": 10, "metrics": 20}
 class Case:
     """A small sweep, and states of it."""
 
-    def __init__(self, algo="td3_sqt"):
+    def __init__(self, algo="td3_sqt", **settings):
         small = {"embedding_size": 16} if ALGORITHMS[algo].assessed else {}
-        self.config, _, self.sweep = make(algo, replay_capacity=CAPACITY, **small)
+        self.config, _, self.sweep = make(algo, replay_capacity=CAPACITY, **small, **settings)
         self.replay = replay_of(self.config, probe_envs.one_step())
         self.template = jax.eval_shape(lambda: start(self.config, self.sweep))
 
+    def advance(self, state, env_steps, learn):
+        return self.sweep.advance(state, env_steps // self.config.train.num_envs, learn)
+
     def trained(self, steps):
-        state = self.sweep.advance(start(self.config, self.sweep, SEEDS), 40, False)
-        return self.sweep.advance(state, steps - 40, True) if steps > 40 else state
+        state = self.advance(start(self.config, self.sweep, SEEDS), 40, False)
+        return self.advance(state, steps - 40, True) if steps > 40 else state
 
     def store(self, folder, keep=2):
         self.said = []
@@ -41,7 +46,7 @@ class Case:
         """Saves at these steps of one training; the state at the last of them."""
         state = self.trained(40)
         for at in steps:
-            state = self.sweep.advance(state, at - int(state.env_steps), at > 40)
+            state = self.advance(state, at - int(state.env_steps), at > 40)
             store.save(state, position(at), LENGTHS)
         store.wait()
         return state
@@ -60,7 +65,11 @@ def listing(store):
     return sorted(path.name for path in store.path.iterdir())
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize(
+    # MaxMin and REDQ are TD3 and SAC of other sizes.
+    "algo",
+    [pytest.param(a, marks=[pytest.mark.slow] if a.startswith(("maxmin", "redq")) else []) for a in ALGORITHMS],
+)
 def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)
@@ -204,17 +213,75 @@ def test_what_a_dead_process_left_half_written_is_removed(case, tmp_path):
     (store.path / "rows_0000000060_0000000070.bin").write_bytes(b"x")
     (store.path / "rows_0000000070_0000000075.bin.part").write_bytes(b"x")
     (store.path / "notes.txt").write_text("not ours")
+    before = listing(store)
+    store = case.store(tmp_path)
+    assert identical(store.restore(case.template).state, state)
+    assert listing(store) == before  # not before it is known that the run goes on
+    store.remove_others()
+    assert listing(store) == ["notes.txt", "rows_0000000000_0000000060.bin", "step_0000000060"]
+
+
+def test_the_rows_of_older_checkpoints_outlive_a_resume(case, tmp_path):
+    """The ring goes round between the two: the later one does not need the first rows."""
+    case.saved(case.store(tmp_path), 60, 130)
+    store = case.store(tmp_path)
+    store.restore(case.template)
+    store.remove_others()
+    (store.path / "step_0000000130" / "manifest.json").unlink()
+    assert identical(case.store(tmp_path).restore(case.template).state, case.trained(60))
+
+
+def test_a_file_that_cannot_be_read_is_no_reason_to_give_a_checkpoint_up(case, tmp_path, monkeypatch):
+    store = case.store(tmp_path)
+    case.saved(store, 50, 60)
+    before = listing(store)
+
+    def crc(path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "crc", crc)
+        with pytest.raises(Refused, match="cannot be read"):
+            case.store(tmp_path).restore(case.template)
+    assert case.said == [] and listing(store) == before
+
+
+def test_another_format_is_refused_and_kept(case, tmp_path, monkeypatch):
+    store = case.store(tmp_path)
+    case.saved(store, 50, 60)
+    before = listing(store)
+    monkeypatch.setattr(manifests, "FORMAT", 99)
+    with pytest.raises(Refused, match="are of format '2', not 99"):
+        case.store(tmp_path).restore(case.template)
+    assert listing(store) == before
+
+
+def test_a_step_is_saved_again_after_its_evaluation(case, tmp_path):
+    store = case.store(tmp_path)
+    case.saved(store, 50, 60)
+    state = train.new_interval(case.trained(60))
+    store.save(state, position(60)._replace(evaluated=60), LENGTHS)
+    store.wait()
+    assert [name for name in listing(store) if name.startswith("step")] == ["step_0000000060", "step_0000000060.1"]
+    restored = case.store(tmp_path).restore(case.template)
+    assert restored.position.evaluated == 60 and identical(restored.state, state)
+
+
+def test_several_environments_per_member_fill_the_ring_side_by_side(tmp_path):
+    case = Case(num_envs=4)
+    state = case.saved(case.store(tmp_path), 48, 100)
     restored = case.store(tmp_path).restore(case.template)
     assert identical(restored.state, state)
-    assert listing(store) == ["notes.txt", "rows_0000000000_0000000060.bin", "step_0000000060"]
+    assert identical(case.sweep.advance(restored.state, 5, True), case.sweep.advance(state, 5, True))
 
 
 def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
     store = case.store(tmp_path)
     case.saved(store, 60)
     other = Case("sac")
-    assert other.store(tmp_path).restore(other.template) is None
-    assert other.said == ["the checkpoint at step 60 cannot be used: it holds another training state than this run's"]
+    with pytest.raises(Refused, match="its checkpoints hold another training state than this run's"):
+        other.store(tmp_path).restore(other.template)
+    assert other.said == [] and identical(case.store(tmp_path).restore(case.template).state, case.trained(60))
 
 
 def test_keys_come_back_as_keys(case, tmp_path):

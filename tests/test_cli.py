@@ -15,6 +15,7 @@ import experiments.run
 from experiments import records
 from experiments.run import main
 from sqt_jax.algorithms import make_config
+from sqt_jax.envs import physics
 
 # The members and sizes that these runs have in common, so that they share compiled programs.
 TINY = (
@@ -179,6 +180,13 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
     late = [row for row in rows if row["env_steps"] != "0"]
     assert {row["member"] for row in late if row["return_mean"]} == {"0", "1"}
     assert [group["final"]["mean"] is None for group in summary["groups"]] == [False, True]
+    # The others do not notice: their rows are those of a run in which nobody diverges.
+    assert run(tmp_path / "good", "--temperature=0.2,0.3") == 0
+    for name in ("evaluations.csv", "metrics.csv"):
+        with_it, without = (rows_of(out / "ant" / "sac_sqt" / "run" / name) for out in (tmp_path, tmp_path / "good"))
+        for ours, theirs in zip(with_it, without, strict=True):
+            del ours["wall_seconds"], theirs["wall_seconds"]
+            assert (ours == theirs) == (ours["member"] in ("0", "1"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -292,7 +300,16 @@ def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, l
 def test_unknown_physics_is_refused(tmp_path, capsys):
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--physics=warp9"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("--physics: takes one of mjx, mujoco, not 'warp9'") and err.count("\n") == 1
+    assert err.startswith("--physics: takes one of mjx, mujoco, warp, not 'warp9'") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("flag", ["physics", "eval_physics"])
+def test_physics_that_cannot_run_here_is_refused(tmp_path, capsys, monkeypatch, flag):
+    monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
+    assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", f"--{flag}=warp"]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", f"--{flag}: warp needs a part; takes one of mjx, mujoco here\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):

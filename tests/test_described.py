@@ -1,6 +1,16 @@
-from datetime import UTC, datetime
+"""config.json of a run tells what it was, and is read back as that."""
 
+import json
+from datetime import UTC, datetime
+from itertools import product
+
+import pytest
+
+from experiments import described
 from experiments.described import default_name
+from sqt_jax.algorithms import make_config
+
+OUTPUT = {"tensorboard": True, "checkpoint_every": 20, "keep_checkpoints": 2}
 
 
 def test_default_name_tells_what_differs():
@@ -9,3 +19,107 @@ def test_default_name_tells_what_differs():
     name = default_name({"preset": "quick", "hidden": (64, 32), "lr": 0.001, "seeds": (0, 1)}, now)
     assert name == "preset=quick_hidden=64+32_lr=0.001_seeds=0+1_20250102T030405Z"
     assert len(default_name({"seeds": tuple(range(1000))}, now)) < 200
+
+
+def members_of(algo="sac_sqt", seeds=(3, 1), sweep=None, **settings):
+    """Members and the names of what is swept."""
+    sweep = sweep or {}
+    small = {"hidden": (8, 4), "steps": 60, "warmup_steps": 20, "batch_size": 8}
+    configs = [
+        make_config(algo, "ant", **small | settings | dict(zip(sweep, values, strict=True)))
+        for values in product(*sweep.values())
+    ]
+    return described.make_members(seeds, configs), list(sweep)
+
+
+RUNS = {
+    "plain": {},
+    "one seed": {"seeds": (2**32 - 1,)},
+    "swept": {"sweep": {"penalty_coef": (0.0, 0.5), "lr": (1e-3, 3e-4, 1e-4)}},
+    "td7": {"algo": "td7_sqt", "embedding_size": 8, "sweep": {"gamma": (0.9, 0.99)}},
+    "several environments": {"num_envs": 4, "eval_every": 20, "replay_capacity": 30},
+    "learned temperature": {"learn_temperature": True, "penalty_inside_gamma": False},
+}
+
+
+def written(path, run):
+    members, swept = members_of(**RUNS[run])
+    content = described.describe(members, swept, ["run", "--x"], "paper", OUTPUT)
+    described.write(path, content)
+    return members, swept, content
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_run_is_read_back_as_it_was_described(tmp_path, run):
+    members, swept, content = written(tmp_path, run)
+    assert described.read(tmp_path) == described.Described(members, swept, json.loads(json.dumps(content)))
+    assert [item.name for item in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_seeds_vary_fastest():
+    members, swept = members_of(seeds=(3, 1), sweep={"lr": (0.1, 0.2)})
+    assert [(member.seed, member.config.agent.lr) for member in members] == [(3, 0.1), (1, 0.1), (3, 0.2), (1, 0.2)]
+    assert swept == ["lr"]
+
+
+def test_settings_of_a_run_have_what_is_swept_as_values():
+    members, swept = members_of(seeds=(3, 1), sweep={"lr": (0.1, 0.2), "tau": (0.5, 0.25)})
+    settings = described.settings_of(members, swept)
+    assert (settings["seeds"], settings["lr"], settings["tau"]) == ((3, 1), (0.1, 0.2), (0.5, 0.25))
+    assert settings.keys() == members[0].config.flat().keys() | {"seeds"}
+    assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)
+
+
+def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
+    members, swept, content = written(tmp_path, "plain")
+    again = described.resumed(content, 100, 40, ["run", "--resume=x"])
+    again = described.resumed(again, 100, 60, ["run", "--resume=y"])
+    assert again["settings"] == content["settings"] | {"steps": 100} and content["resumed"] == []
+    assert [(entry["env_steps"], entry["command"][1]) for entry in again["resumed"]] == [
+        (40, "--resume=x"),
+        (60, "--resume=y"),
+    ]
+    assert all(entry["versions"] == described.versions() and entry["at"] for entry in again["resumed"])
+    for unchanged in content.keys() - {"settings", "resumed"}:
+        assert again[unchanged] == content[unchanged]
+    described.write(tmp_path, again)
+    read = described.read(tmp_path)
+    assert {member.config.train.steps for member in read.members} == {100} and read.content["replay_rows"] == 60
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"swept": ["steps"]}, "does not describe a run"),
+        ({"swept": ["penalty_coef", "penalty_coef"]}, "does not describe a run"),
+        ({"swept": 5}, "does not describe a run"),
+        ({"members": []}, "does not describe a run"),
+        ({"members": [{"seed": 1}] * 10_001}, "does not describe a run"),
+        ({"members": [{"seed": -1, "penalty_coef": 0, "lr": 0.1}]}, "does not describe a run"),
+        ({"members": [{"seed": 1.0, "penalty_coef": 0, "lr": 0.1}]}, "does not describe a run"),
+        ({"members": [{"seed": 1, "penalty_coef": 0, "lr": 7}]}, "a setting that cannot be: --lr: takes a number"),
+        ({"members": [{"seed": 1, "penalty_coef": 0, "lr": "x" * 5000}]}, "a setting that cannot be: --lr: takes"),
+        ({"settings": {}}, "does not describe a run"),
+        ({"replay_rows": 61}, "a replay that cannot be"),
+        ({"replay_rows": 7}, "a replay that cannot be"),
+        ({"replay_rows": "60"}, "does not describe a run"),
+        ({"output": None}, "does not describe a run"),
+        ({"versions": []}, "does not describe a run"),
+        ({"resumed": {}}, "does not describe a run"),
+        ({"preset": 5}, "does not describe a run"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_what_describes_no_run_is_refused(tmp_path, change, message):
+    _, _, content = written(tmp_path, "swept")
+    described.write(tmp_path, content | change)
+    with pytest.raises(described.NotDescribed, match=message) as error:
+        described.read(tmp_path)
+    assert len(str(error.value)) < 500
+
+
+def test_what_json_has_no_word_for_is_not_written(tmp_path):
+    _, _, content = written(tmp_path, "plain")
+    with pytest.raises(ValueError):
+        described.write(tmp_path, content | {"lr": float("nan")})
+    assert described.read(tmp_path).content["preset"] == "paper"

@@ -171,6 +171,23 @@ def test_actions_are_stretched_to_the_actuators_range(name, recording_physics):
     np.testing.assert_allclose(excess.state.task.internal, limit, rtol=1e-6)
 
 
+def test_a_tasks_options_reach_its_physics_and_give_way_to_the_callers(monkeypatch):
+    seen = []
+
+    def make_physics(name, setup, **options):
+        seen.append((name, options))
+        return Physics(lambda qpos, qvel: state(qpos, qvel), None)
+
+    monkeypatch.setattr(gym_tasks, "make_physics", make_physics)
+    for physics, options in [("mjx", {}), ("mjx", {"iterations": 20}), ("mujoco", {})]:
+        envs.make("ant", physics, **options)
+    assert seen == [
+        ("mjx", {"iterations": 7, "ls_iterations": 3}),
+        ("mjx", {"iterations": 20, "ls_iterations": 3}),
+        ("mujoco", {}),
+    ]
+
+
 @pytest.fixture
 def recording_physics(monkeypatch):
     """A simulator in which nothing moves and the state keeps the last control."""

@@ -16,6 +16,7 @@ LAYERS = [
         "sqt_jax.q_targets",
         "sqt_jax.networks",
         "sqt_jax.losses",
+        "sqt_jax.bias",
         "sqt_jax.optimizers",
         "sqt_jax.replay",
     },

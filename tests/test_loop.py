@@ -43,7 +43,8 @@ class Recorder:
 
     def evaluate(self, state):
         self.now += 0.5
-        return Evaluation(np.array([[self.done, self.done + 2], [0.0, 0.0]]), np.full((2, 2), 10))
+        evaluation = Evaluation(np.array([[self.done, self.done + 2], [0.0, 0.0]]), np.full((2, 2), 10))
+        return evaluation, {"value_bias": np.array([1.5, -2.5])}
 
     def run(self, stop=lambda: False, **options):
         self.saved = []
@@ -76,6 +77,7 @@ def test_evaluations_lie_at_zero_every_interval_and_the_end():
     assert [report.env_steps for report in recorder.reports] == [0, 500, 1_000, 1_500, 2_000]
     assert recorder.reports[0].metrics == {}
     assert recorder.reports[2].returns.tolist() == [[1_000, 1_002], [0, 0]]
+    assert all(report.bias["value_bias"].tolist() == [1.5, -2.5] for report in recorder.reports)
     assert (outcome.env_steps, outcome.interrupted, outcome.diverged) == (2_000, False, {})
 
 
@@ -145,7 +147,8 @@ def test_a_member_that_diverges_is_named_once_and_its_later_returns_do_not_count
     assert recorder.messages == ["member 1 diverged at step 800: it stays as it was before, the others go on"]
     assert not outcome.interrupted and outcome.env_steps == 2_000
     for report in recorder.reports:
-        assert np.isnan(report.returns[1]).all() == (report.env_steps >= 1_000)
+        left_out = report.env_steps >= 1_000
+        assert np.isnan(report.returns[1]).all() == np.isnan(report.bias["value_bias"][1]) == left_out
         assert np.isfinite(report.returns[0]).all()
 
 
@@ -189,6 +192,13 @@ def test_a_run_goes_on_where_it_stood(at, evaluated, left):
     assert outcome.diverged == {1: 800} and recorder.messages == []
     assert outcome.wall_seconds == pytest.approx(7 + recorder.now)
     assert all(np.isnan(report.returns[1]).all() for report in recorder.reports)
+
+
+def test_where_only_the_last_evaluation_is_left_a_checkpoint_follows_it():
+    recorder = Recorder(TRAIN)
+    recorder.run(start=Position(2_000, 1_500), checkpoint_every=250)
+    assert recorder.calls == [] and [report.env_steps for report in recorder.reports] == [2_000]
+    assert [(at.env_steps, at.evaluated) for at in recorder.saved] == [(2_000, 2_000)]
 
 
 def test_a_run_that_is_done_stays_as_it_is():

@@ -26,10 +26,30 @@ def test_a_replays_row_names_what_was_measured(kind, what):
     assert (row.members, row.unit) == (2, f"{what}s") and row.rate > 0
 
 
+def test_timed_calls_take_turns(monkeypatch):
+    now, calls = 0.0, []
+
+    def run(name, seconds_each):
+        def once(iterations):
+            nonlocal now
+            calls.append(name)
+            now += seconds_each * iterations
+
+        return once
+
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: now)
+    found = measure.measure_in_turns([run("a", 0.5), run("b", 0.25)], seconds=1, repeats=3)
+    assert found == [(2.0, 0.5), (4.0, 0.25)]
+    assert "".join(calls).endswith("ababab")
+
+
 @pytest.mark.parametrize("task", ["swimmer", "humanoid"])
-def test_mujoco_alone_is_measured_with_and_without_contact_forces(task):
-    row = measure.bench_bare(task, 3, **SHORT)
-    assert (row.suite, row.what, row.members) == ("physics", f"{task}, MuJoCo alone", 3) and row.rate > 0
+def test_mujoco_alone_steps_with_and_without_contact_forces(task, monkeypatch):
+    made = []
+    original = measure.mujoco.mj_rnePostConstraint
+    monkeypatch.setattr(measure.mujoco, "mj_rnePostConstraint", lambda *args: made.append(original(*args)))
+    measure.bare_steps(task, 3)(2)
+    assert len(made) == (6 if task == "humanoid" else 0)
 
 
 def test_an_updates_row_counts_the_updates_of_all_members():

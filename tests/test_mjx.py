@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from gym_reference import MJX_TASKS, ours, placed, recorded
+from gym_reference import COUNT, MJX_TASKS, compiled_step, environment, ours, placed, recorded
 
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
@@ -169,3 +169,17 @@ def test_first_state_is_at_rest_of_forces(name):
     assert all(not np.any(v) for v in forces.values())
     assert not np.any(timestep.state.task.displacement)
     assert np.isfinite(timestep.obs).all()
+
+
+@pytest.mark.parametrize("fault", [np.nan, np.inf, 1e11])
+def test_a_diverged_robot_ends_its_episode_and_no_other(fault):
+    first = placed("ant")
+    broken = first.state.task._replace(qvel=first.state.task.qvel.at[1, 2].set(fault))
+    broken = first._replace(state=first.state._replace(task=broken))
+    expected, after = ours("ant")[1], compiled_step("ant")(broken, recorded("ant").action)
+    others = np.arange(COUNT) != 1
+    assert after.terminated[1] and after.reward[1] == 0
+    np.testing.assert_array_equal(after.terminated[others], expected.terminated[others])
+    np.testing.assert_array_equal(after.final_obs[1], first.obs[1])
+    assert all(np.all(np.isfinite(x)) for x in (after.obs, after.reward, after.final_obs))
+    assert jax.vmap(environment("ant").status)(after)["unstable_steps"].tolist() == (~others).astype(int).tolist()

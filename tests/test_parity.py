@@ -67,3 +67,12 @@ def test_wrong_names_are_told_in_one_line(flag, value):
     with flagsaver.flagsaver(**{flag: [value]}), pytest.raises(SystemExit) as error:
         parity.main(["parity"])
     assert str(error.value).startswith(f"--{flag}: takes some of ") and "\n" not in str(error.value)
+
+
+def test_limits_of_mjxs_solver_are_rows_of_their_own():
+    parity.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(solver=["8/3"]):
+        found = parity.cases(["mjx", "mujoco"])
+        assert parity.cases(["mujoco"]).keys() == {"mujoco"}
+    assert found["mjx 8/3"] == ("mjx", {"iterations": 8, "ls_iterations": 3})
+    assert found["mjx"] == ("mjx", {}) and list(found) == ["mjx", "mujoco", "mjx 8/3"]

@@ -1,46 +1,56 @@
-import numpy as np
 import pytest
+from made_runs import write_run
 from matplotlib.image import imread
 
-from experiments.plots import COLOURS, draw_curves
-from experiments.records import EVALUATION_COLUMNS
+from experiments.plots import main
 
 
-def table_of(curves, coefs, q_std=1.0):
-    """Columns of an evaluations.csv: `curves` [members, evaluations], a coefficient per member."""
-    curves = np.asarray(curves, float)
-    members, evaluations = curves.shape
-    table = {name: np.zeros(members * evaluations) for name in EVALUATION_COLUMNS}
-    table["member"] = np.repeat(np.arange(members, dtype=float), evaluations)
-    table["seed"] = table["member"]
-    table["penalty_coef"] = np.repeat(np.asarray(coefs, float), evaluations)
-    table["env_steps"] = np.tile(np.arange(evaluations) * 1000.0, members)
-    table["return_mean"] = curves.ravel()
-    table["q_std"] = np.full(members * evaluations, q_std)
-    return table
+@pytest.fixture
+def runs(tmp_path):
+    write_run(tmp_path / "runs", "td3", curves=[[0, 5, 9], [0, 6, 8]])
+    bias = {name: [[float("nan"), 2, 3]] * 4 for name in ("value_bias", "value_bias_normalised")}
+    curves = [[0, 4, value] for value in (8, 9, 10, 12)]
+    write_run(tmp_path / "runs", "td3_sqt", curves=curves, swept={"penalty_coef": (0.1, 0.5)}, more=bias)
+    return tmp_path / "runs"
 
 
-def pixels_of(image, colour):
-    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-    return int((np.abs(image[..., :3] - rgb).max(axis=-1) < 0.02).sum())
+def test_every_figure_is_drawn_and_replaced_only_where_asked(runs, tmp_path, capsys):
+    out = tmp_path / "figures"
+    assert main(["plots", str(runs), f"--out={out}"]) == 0
+    names = ["learning_curves", "q_std", "value_bias", "value_bias_normalised", "penalty_sweep", "performance_profile"]
+    assert capsys.readouterr().out.split() == [str(out / f"{name}.png") for name in names]
+    assert {path.name for path in out.iterdir()} == {f"{name}.png" for name in names}
+    for path in out.iterdir():
+        assert imread(path).std() > 0.05  # not blank
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert main(["plots", str(runs), f"--out={out}"]) == 2
+    assert "learning_curves.png is there already" in capsys.readouterr().err
+    assert main(["plots", str(runs), f"--out={out}", "--overwrite"]) == 0
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_each_group_is_drawn_in_its_own_colour(tmp_path):
-    draw_curves(table_of([[0, 1, 2], [1, 2, 3], [5, 4, 3]], [0.1, 0.1, 0.5]), tmp_path / "curves.png", "td3 on ant")
-    image = imread(tmp_path / "curves.png")
-    assert image.shape[1] > 1000
-    assert pixels_of(image, COLOURS[0]) > 500 and pixels_of(image, COLOURS[1]) > 500
-    assert pixels_of(image, COLOURS[2]) == 0
+def test_what_there_is_nothing_of_is_said(runs, tmp_path, capsys):
+    out = tmp_path / "figures"
+    argv = ["plots", str(runs / "cheetah" / "td3"), f"--out={out}", "--format=svg", "--statistic=mean"]
+    assert main(argv) == 0
+    assert "nothing to draw: value_bias, penalty_sweep" in capsys.readouterr().err
+    assert {path.name for path in out.iterdir()} == {"learning_curves.svg", "q_std.svg", "performance_profile.svg"}
 
 
-@pytest.mark.parametrize("curves", [[[1.0]], [[1.0, np.nan, 2.0], [2.0, 3.0, np.nan]], [[np.nan, np.nan]]])
-def test_short_and_broken_curves_are_drawn_without_complaint(tmp_path, curves, recwarn):
-    draw_curves(table_of(curves, [0.5] * len(curves), q_std=np.nan), tmp_path / "curves.png", "td3 on ant")
-    assert (tmp_path / "curves.png").stat().st_size > 10_000
-    assert not recwarn.list
-
-
-def test_a_member_that_is_an_evaluation_short_is_drawn(tmp_path):
-    table = table_of([[0, 1, 2], [1, 2, 3]], [0.1, 0.1])
-    draw_curves({name: column[:-1] for name, column in table.items()}, tmp_path / "curves.png", "td3 on ant")
-    assert pixels_of(imread(tmp_path / "curves.png"), COLOURS[0]) > 500
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ([], "RUNS: takes folders of runs"),
+        (["runs", "--format=gif"], "--format: takes one of png, svg, pdf, not 'gif'"),
+        (["runs", "--statistic=median"], "--statistic: takes one of iqm, mean, not 'median'"),
+        (["runs", "--overwite"], "--overwite: unknown flag; did you mean --overwrite?"),
+        (["none"], "none: there is no such folder"),
+    ],
+)
+def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["plots", *argv]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and captured.err.count("\n") == 1 and not captured.out
+    assert sorted(tmp_path.rglob("*")) == before

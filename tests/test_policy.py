@@ -1,8 +1,13 @@
 """A saved policy acts as the agent that it was saved from, and loading refuses what does not fit."""
 
 import json
+import os
+import pickle
+import shutil
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -51,17 +56,177 @@ def test_parameters_of_other_sizes_are_refused(tmp_path):
         policy.load_policy(tmp_path / "policy")
 
 
-def test_pickled_content_is_refused(tmp_path):
-    saved("td3", tmp_path / "policy")
-    np.savez(tmp_path / "policy" / "member_0.npz", x=np.array([{"code": 1}], dtype=object))
-    with pytest.raises(ValueError, match="allow_pickle"):
-        policy.load_policy(tmp_path / "policy")
-
-
 def test_a_missing_member_is_named(tmp_path):
     saved("td3", tmp_path / "policy")
     with pytest.raises(FileNotFoundError, match="member_7"):
         policy.load_policy(tmp_path / "policy", member=7)
+
+
+# A folder that was made to do harm, or came to it. Damage takes the folder.
+
+
+class Touch:
+    """Unpickling it makes a file."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("hacked"),)
+
+
+def written(name, content):
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def settings(**changes):
+    def damage(folder):
+        config = json.loads((folder / "config.json").read_text())
+        (folder / "config.json").write_text(json.dumps(config | changes))
+
+    return damage
+
+
+def without(key):
+    def damage(folder):
+        config = json.loads((folder / "config.json").read_text())
+        del config[key]
+        (folder / "config.json").write_text(json.dumps(config))
+
+    return damage
+
+
+def parameters(change, save=np.savez):
+    """`change` takes the arrays of member 0 by name, and gives others."""
+
+    def damage(folder):
+        with np.load(folder / "member_0.npz") as file:
+            arrays = {name: file[name] for name in file.files}
+        save(folder / "member_0.npz", **change(arrays))
+
+    return damage
+
+
+def every(change):
+    return parameters(lambda arrays: {name: change(array) for name, array in arrays.items()})
+
+
+def cut(name, keep):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:keep])
+
+
+def flipped(folder):
+    content = bytearray((folder / "member_0.npz").read_bytes())
+    content[len(content) // 3] ^= 255
+    (folder / "member_0.npz").write_bytes(content)
+
+
+def header(text):
+    """Arrays whose header says `text` and that hold nothing."""
+
+    def damage(folder):
+        with zipfile.ZipFile(folder / "member_0.npz") as archive:
+            names = archive.namelist()
+        magic = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little")
+        with zipfile.ZipFile(folder / "member_0.npz", "w") as archive:
+            for name in names:
+                archive.writestr(name, magic + text.encode())
+
+    return damage
+
+
+def bomb(folder):
+    """Few bytes that decompress to many."""
+    with zipfile.ZipFile(folder / "member_0.npz") as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(folder / "member_0.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content + bytes(10_000_000))
+
+
+def pickled(folder):
+    (folder / "member_0.npz").write_bytes(pickle.dumps(Touch()))
+
+
+def a_pipe(folder):
+    (folder / "member_0.npz").unlink()
+    os.mkfifo(folder / "member_0.npz")
+
+
+NOT_SETTINGS, NOT_PARAMETERS, OTHER = "not the settings of", "not the parameters of", "does not hold a policy"
+HOSTILE = {
+    "config truncated": (cut("config.json", -20), NOT_SETTINGS),
+    "config empty": (written("config.json", b""), NOT_SETTINGS),
+    "config a list": (written("config.json", b"[1, 2]"), NOT_SETTINGS),
+    "config a number": (written("config.json", b"1"), NOT_SETTINGS),
+    "config deep": (written("config.json", b"[" * 100_000), NOT_SETTINGS),
+    "config large": (written("config.json", b" " * 1_000_001), NOT_SETTINGS),
+    "config pickled": (written("config.json", b"\x80\x04K\x01."), NOT_SETTINGS),
+    "config missing": (lambda folder: (folder / "config.json").unlink(), "there is no such file"),
+    "no algorithm": (without("algo"), NOT_SETTINGS),
+    "no size": (without("action_size"), NOT_SETTINGS),
+    "another algorithm": (settings(algo="ppo"), NOT_SETTINGS),
+    "algorithm a list": (settings(algo=["td3"]), NOT_SETTINGS),
+    "unknown setting": (settings(stepz=1), NOT_SETTINGS),
+    "out of range": (settings(gamma=2), NOT_SETTINGS),
+    "environment a path": (settings(env="../../x"), NOT_SETTINGS),
+    "size too large": (settings(observation_size=10**12), NOT_SETTINGS),
+    "size far too large": (settings(action_size=10**400), NOT_SETTINGS),
+    "size zero": (settings(observation_size=0), NOT_SETTINGS),
+    "size a word": (settings(observation_size="2"), NOT_SETTINGS),
+    "size true": (settings(action_size=True), NOT_SETTINGS),
+    "other size": (settings(action_size=1_000_000), OTHER),
+    "wide": (settings(hidden=[65536, 65536]), OTHER),
+    "layers without end": (settings(hidden=[8] * 10_000), NOT_SETTINGS),
+    "critics without end": (settings(ensemble_size=10**9), NOT_SETTINGS),
+    "parameters truncated": (cut("member_0.npz", -50), NOT_PARAMETERS),
+    "parameters empty": (cut("member_0.npz", 0), NOT_PARAMETERS),
+    "parameters flipped": (flipped, "not the parameters of|does not hold"),
+    "parameters pickled": (pickled, NOT_PARAMETERS),
+    "objects": (every(lambda array: np.full(array.shape, Touch(), dtype=object)), OTHER),
+    "other type": (every(lambda array: array.astype(np.float64)), OTHER),
+    "other byte order": (every(lambda array: array.astype(">f4")), OTHER),
+    "other shape": (every(lambda array: array[None]), OTHER),
+    "no shape": (every(lambda array: np.float32(0)), OTHER),
+    "one array": (lambda folder: np.save((folder / "member_0.npz").open("wb"), np.zeros(3)), NOT_PARAMETERS),
+    "none of the arrays": (parameters(lambda arrays: {}), OTHER),
+    "one array more": (parameters(lambda arrays: arrays | {"../../more": np.zeros(3)}), OTHER),
+    "absurd shape": (header("{'descr': '<f4', 'fortran_order': False, 'shape': (10**15,), }"), NOT_PARAMETERS),
+    "large shape": (header("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }"), OTHER),
+    "header a call": (header("__import__('os').mkdir('hacked')"), NOT_PARAMETERS),
+    "header of nothing": (header("((("), NOT_PARAMETERS),
+    "header indented": (header("{\n  1\n 2"), NOT_PARAMETERS),
+    "bomb": (bomb, NOT_PARAMETERS),
+    "a pipe": (a_pipe, "there is no such file"),
+}
+
+
+@pytest.fixture(scope="module")
+def td3_policy(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("td3") / "policy"
+    saved("td3", folder)
+    return folder
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_folder_is_refused_in_one_line(td3_policy, tmp_path, monkeypatch, case):
+    damage, message = HOSTILE[case]
+    folder = tmp_path / "policy"
+    shutil.copytree(td3_policy, folder)
+    monkeypatch.chdir(tmp_path)
+    damage(folder)
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+        policy.load_policy(folder)
+    line = str(error.value)
+    assert line.startswith(str(folder)) and line.isprintable() and len(line) < len(str(folder)) + 500
+    assert [item.name for item in tmp_path.iterdir()] == ["policy"]  # no code was run
+
+
+def test_a_compressed_policy_is_read_too(td3_policy, tmp_path):
+    folder = tmp_path / "policy"
+    shutil.copytree(td3_policy, folder)
+    parameters(lambda arrays: {name: np.asfortranarray(array) for name, array in arrays.items()}, np.savez_compressed)(
+        folder
+    )
+    obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
+    np.testing.assert_array_equal(policy.load_policy(folder)(obs), policy.load_policy(td3_policy)(obs))
 
 
 ELSEWHERE = """

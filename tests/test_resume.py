@@ -10,7 +10,8 @@ import probe_envs
 import pytest
 from test_cli import rows_of, run
 
-from experiments import checkpoints, records
+import experiments.run
+from experiments import checkpoints, described, loop, records
 from experiments.killtest import differences, result_of
 from experiments.run import main
 
@@ -122,15 +123,80 @@ def test_a_diverged_member_stays_so(tmp_path, capsys):
     assert [row["return_mean"] for row in late] == ["5.0", "5.0", "", ""]
 
 
-def test_without_checkpoints_a_run_starts_anew(tmp_path, monkeypatch, capsys, whole):
-    with monkeypatch.context() as patch:
-        patch.setattr(sys.modules[__name__], "MEMBERS", ("--penalty_coef=0,0.5", "--checkpoint_every=0"))
-        interrupted(tmp_path, monkeypatch, 50)
+def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
+    assert run(tmp_path, "--checkpoint_every=0") == 0
     assert not (path_in(tmp_path) / "checkpoint").exists()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     capsys.readouterr()
-    assert resume(tmp_path, "--checkpoint_every=20") == 0
-    assert "going on with it from the start: it has no whole checkpoint" in capsys.readouterr().out
+    assert resume(tmp_path, "--checkpoint_every=20") == 2
+    assert "takes a run with checkpoints to go on from; it has none" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("where", ["described.write", "Records", "train_loop"])
+def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monkeypatch, whole, where):
+    """Wherever: the same command with --resume is understood."""
+
+    class Killed(BaseException):
+        pass
+
+    def die(*_, **__):
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        target = {"described.write": described, "Records": records, "train_loop": experiments.run}[where]
+        patch.setattr(target, where.split(".")[-1], die)
+        run(tmp_path, *MEMBERS)
+    assert run(tmp_path, *MEMBERS, "--resume") == 0
     assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+
+
+def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole):
+    """The last step is made, and its evaluation is not."""
+
+    def stopped(*arguments, stop, **options):
+        original = arguments[0].advance
+        last = []
+
+        def advance(state, steps, learn):
+            state = original(state, steps, learn)
+            last.append(int(state.env_steps))
+            return state
+
+        return loop.train_loop(
+            arguments[0]._replace(advance=advance),
+            *arguments[1:],
+            stop=lambda: bool(last) and last[-1] == 120,
+            **options,
+        )
+
+    with monkeypatch.context() as patch:
+        patch.setattr(experiments.run, "train_loop", stopped)
+        assert run(tmp_path, *MEMBERS) == 130
+    assert resume(tmp_path) == 0
+    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+
+
+def test_steps_that_cannot_be_are_refused_and_the_run_stays_as_it_was(tmp_path, capsys):
+    assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert resume(tmp_path, "--steps=141") == 2
+    assert capsys.readouterr().err.startswith("--steps: takes a multiple of num_envs (2), not 141")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatch):
+    assert run(tmp_path, *MEMBERS) == 0
+    seen = []
+
+    def looked_at(*arguments, **options):
+        seen.append((path_in(tmp_path) / "summary.json").exists())
+        return loop.train_loop(*arguments, **options)
+
+    monkeypatch.setattr(experiments.run, "train_loop", looked_at)
+    assert resume(tmp_path, "--steps=140", "--keep_checkpoints=3") == 0
+    assert seen == [False]
+    assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
 
 
 @pytest.mark.slow

@@ -349,7 +349,7 @@ def test_evaluation_plays_the_checkpoint(trained):
     state = trained.states[-1]
     act = jax.jit(jax.vmap(lambda policy: trained.agent.policy_action(policy, obs)[0, 0]))
     worth = np.asarray(act(state.checkpoints.checkpoint))
-    returns = np.asarray(trained.sweep.evaluate(trained.final).returns)
+    returns = np.asarray(trained.sweep.evaluate(trained.final)[0].returns)
     np.testing.assert_allclose(returns, EPISODE * worth[:, None].repeat(2, axis=1), rtol=1e-5, atol=1e-6)
     learner = td7.Policy(state.actor, state.fixed_encoder)
     for other in (state.checkpoints.snapshot, learner):

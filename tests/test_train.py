@@ -10,6 +10,7 @@ import probe_envs
 import pytest
 
 from sqt_jax import algorithms, train
+from sqt_jax.agents import critic
 from sqt_jax.algorithms import ALGORITHMS
 
 TINY = {
@@ -86,6 +87,20 @@ def test_updates_per_step_and_num_envs_multiply():
     assert state.env_steps == 40 and state.replay.size == 40
     state, _ = advance(sweep, state, 5, True)
     assert state.env_steps == 60 and state.agent.gradient_steps == 5 * 4 * 3
+
+
+def test_diverged_physics_are_counted_and_never_reach_the_replay():
+    config, _, sweep = make("td3", probe_envs.diverging)
+    state, metrics = advance(sweep, start(config, sweep), 40, False)
+    rows = np.asarray(state.replay.storage[:, :40])  # obs, action, next_obs, reward, discount
+    broken = rows[..., 1] > 0
+    assert np.isfinite(rows).all() and broken.any(axis=1).all()
+    np.testing.assert_array_equal(metrics["unstable_steps"], broken.sum(axis=1))
+    np.testing.assert_array_equal(rows[..., 4], ~broken)  # the episode terminated
+    np.testing.assert_array_equal(rows[..., 3], ~broken)  # with reward 0
+    np.testing.assert_array_equal(rows[..., 2], rows[..., 0])  # this task's state never changes
+    state, metrics = advance(sweep, state, 30, True)
+    assert np.isfinite(metrics["critic_loss"]).all() and np.isfinite(state.replay.storage).all()
 
 
 def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):
@@ -204,11 +219,11 @@ def test_evaluation_leaves_the_state_alone_and_draws_new_starts_each_time(td3):
     config, _, sweep = td3
     state, _ = advance(sweep, start(config, sweep), 40, False)
     copy = numbers(state)
-    first = sweep.evaluate(state)
+    first, _ = sweep.evaluate(state)
     assert all(np.array_equal(a, b) for a, b in zip(copy, numbers(state), strict=True))
-    assert np.array_equal(first.returns, sweep.evaluate(state).returns)
+    assert np.array_equal(first.returns, sweep.evaluate(state)[0].returns)
     state, _ = advance(sweep, state, 1, False)
-    assert not np.isclose(first.returns, sweep.evaluate(state).returns).any()
+    assert not np.isclose(first.returns, sweep.evaluate(state)[0].returns).any()
 
 
 def test_the_compiled_text_writes_the_replay_in_place():
@@ -230,13 +245,13 @@ def test_make_train_under_vmap_is_the_sweep(td3):
     assert history.env_steps[0].tolist() == [0, 100, 200, 300, 400]
     assert history.returns.shape == (3, 5, 2)
     state = start(config, sweep)
-    returns = [sweep.evaluate(state).returns]
+    returns = [sweep.evaluate(state)[0].returns]
     for first, last in zip(range(0, 400, 100), range(100, 401, 100), strict=True):
         state = train.new_interval(state)
         for steps, learn in train.segments(first, last, config.train):
             state = sweep.advance(state, steps, learn)
         metrics = sweep.measure(state)
-        returns.append(sweep.evaluate(state).returns)
+        returns.append(sweep.evaluate(state)[0].returns)
     np.testing.assert_allclose(history.returns, jnp.stack(returns, 1), rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(history.metrics["critic_loss"][:, -1], metrics["critic_loss"], rtol=1e-2)
     assert np.isnan(history.metrics["critic_loss"][:, 0]).all()
@@ -348,3 +363,56 @@ def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):
             np.testing.assert_array_equal(a[2], frozen[2])
     np.testing.assert_array_equal(hurt.timestep.obs[others], whole.timestep.obs[others])
     assert np.isfinite(hurt.timestep.obs).all()
+
+
+def largest_of_critics(next_q):
+    return jnp.max(next_q, axis=0)
+
+
+def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
+    """The true value is 5 everywhere. The largest of five critics overestimates, a strong penalty underestimates."""
+    settings = {"ensemble_size": 5, "warmup_steps": 100, "lr": 3e-3, "tau": 0.1, "gamma": 0.8, "steps": 1_000}
+    found = {}
+    for name in ("largest", "smallest"):
+        with monkeypatch.context() as patch:
+            if name == "largest":
+                patch.setattr(critic, "_reduction", lambda config, subset: largest_of_critics)
+            config, _, sweep = make.__wrapped__(
+                "td3_sqt", functools.partial(probe_envs.constant_reward, 60), **settings
+            )
+            coefs = [0.0] * 3 if name == "largest" else [2.0] * 3
+            state = sweep.advance(start(config, sweep, penalty_coef=coefs), 100, False)
+            state = sweep.advance(state, 900, True)
+            found[name] = {key: np.asarray(value) for key, value in sweep.evaluate(state)[1].items()}
+    largest, smallest = found["largest"], found["smallest"]
+    assert (largest["value_bias"] > 0).all() and (smallest["value_bias"] < 0).all()
+    for biases in found.values():
+        assert (biases["value_bias_min"] < biases["value_bias"]).all()
+        np.testing.assert_allclose(biases["value_bias_normalised"], biases["value_bias"] / 5, rtol=0.05)
+
+
+@pytest.mark.parametrize("algo", ["sac", "td7"])
+def test_critics_are_judged_by_the_policy_whose_values_they_estimate(algo):
+    """SAC's critics by its samples, entropy included; TD7's by the checkpoint, which is what evaluation plays."""
+    small = {"embedding_size": 16} if algo == "td7" else {}
+    config, _, sweep = make(algo, functools.partial(probe_envs.countdown, 3), **small)
+    state = sweep.advance(start(config, sweep), 40, False)
+    state = sweep.advance(state, 60, True)
+    evaluation, bias = sweep.evaluate(state)
+    assert evaluation.returns.shape == (3, config.train.eval_episodes)
+    assert np.isfinite(bias["value_bias"]).all()
+    obs = jnp.array([[0.0], [1.0], [2.0]])
+    agent = algorithms.agent_of(config, probe_envs.countdown(3))
+    for member in range(3):
+        own = jax.tree.map(lambda x, m=member: x[m] if x.ndim else x, state.agent)
+        if algo == "sac":
+            # The bonus of an action is -temperature log pi: on average over many, the same along each episode.
+            _, bonus = agent.valued_act(own, jnp.repeat(obs, 4_000, axis=0), jax.random.key(1))
+            bonus = np.mean(np.asarray(bonus).reshape(3, -1), axis=1)
+        else:
+            assert agent.valued_act is None
+            bonus = np.zeros(3)
+        truth = np.array([1 + 0.9 * (bonus[1] + 1 + 0.9 * (bonus[2] + 1)), 1 + 0.9 * (bonus[2] + 1), 1.0])
+        action = agent.act(own, obs, jax.random.key(0), deterministic=True)
+        q = np.asarray(agent.q_values(own, obs, action)).mean(axis=0)
+        assert bias["value_bias"][member] == pytest.approx(np.mean(q - truth), abs=0.3 if algo == "sac" else 1e-3)

@@ -151,7 +151,26 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         state = state._replace(target_critic=target_critic, gradient_steps=gradient_steps)
         return state, td_error, metrics | actor_metrics
 
+    def q_values(state: SACState, obs: Array, action: Array) -> Array:
+        return critic_net.apply(state.critic, obs, action)
+
+    def valued_act(state: SACState, obs: Array, key: Array) -> tuple[Array, Array]:
+        output = actor_net.apply(state.actor, obs)
+        action, log_prob = output.sample(jax.random.normal(key, output.mean.shape), config.squashed_log_prob)
+        return action, -temperature(state) * log_prob
+
     def update(state: SACState, batch: Transition, key: Array) -> tuple[SACState, Array, Metrics]:
         return update_with_noise(state, batch, acting.draw_noise(key, batch))
 
-    return Agent(init, act, update, acting.draw_noise, update_with_noise, td_target, policy, policy_action)
+    return Agent(
+        init,
+        act,
+        update,
+        acting.draw_noise,
+        update_with_noise,
+        td_target,
+        policy,
+        policy_action,
+        q_values,
+        valued_act,
+    )

@@ -154,7 +154,10 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         state, actor_loss = jax.lax.cond(due, delayed, skip, state)
         return state._replace(gradient_steps=gradient_steps), td_error, metrics | {"actor_loss": actor_loss}
 
+    def q_values(state: TD3State, obs: Array, action: Array) -> Array:
+        return critic_net.apply(state.critic, obs, action)
+
     def update(state: TD3State, batch: Transition, key: Array) -> tuple[TD3State, Array, Metrics]:
         return update_with_noise(state, batch, acting.draw_noise(key, batch))
 
-    return Agent(init, act, update, acting.draw_noise, update_with_noise, td_target, policy, policy_action)
+    return Agent(init, act, update, acting.draw_noise, update_with_noise, td_target, policy, policy_action, q_values)

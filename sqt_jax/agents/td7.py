@@ -237,6 +237,15 @@ def make_sale_agent(
     def update(state: TD7State, batch: Transition, key: Array) -> tuple[TD7State, Array, Metrics]:
         return update_with_noise(state, batch, acting.draw_noise(key, batch))
 
+    def q_values(state: TD7State, obs: Array, action: Array) -> Array:
+        zs = encoder_net.zs(state.fixed_encoder, obs)
+        return critic_net.apply(state.critic, obs, action, encoder_net.zsa(state.fixed_encoder, zs, action), zs)
+
+    def valued_act(state: TD7State, obs: Array, key: Array) -> tuple[Array, Array]:
+        gaussian = output(learner(state), obs)
+        action, log_prob = gaussian.sample(jax.random.normal(key, gaussian.mean.shape), config.squashed_log_prob)
+        return action, -state.scalars.temperature * log_prob
+
     def status(state: TD7State) -> Metrics:
         metrics: Metrics = assessment.status(state.checkpoints) if state.checkpoints else {}
         if state.value_bounds:
@@ -252,6 +261,8 @@ def make_sale_agent(
         td_target,
         evaluated_policy,
         policy_action,
+        q_values,
+        valued_act if acting.entropy else None,
         observe,
         status,
     )

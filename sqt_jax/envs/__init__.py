@@ -5,11 +5,11 @@ from typing import Any
 from sqt_jax.envs import brax_envs, gym_table
 from sqt_jax.envs.gym_table import ALIASES, TASKS
 from sqt_jax.envs.gym_tasks import make_task
-from sqt_jax.envs.physics import PHYSICS
+from sqt_jax.envs.physics import PHYSICS, lacks
 from sqt_jax.names import unknown
 from sqt_jax.types import Environment
 
-__all__ = ["ALIASES", "PHYSICS", "TASKS", "make", "resolve", "simulators"]
+__all__ = ["ALIASES", "PHYSICS", "TASKS", "lacks", "make", "resolve", "simulators"]
 
 
 def resolve(name: str) -> str:
@@ -37,7 +37,7 @@ def make(name: str, physics: str | None = None, **options: Any) -> Environment:
     Without `physics`, on the first of its `simulators`.
 
     Raises:
-      ValueError: the environment or the simulator is unknown.
+      ValueError: the environment or the simulator is unknown, or the simulator cannot run here (`lacks`).
       TypeError: the simulator has no such option.
     """
     name = resolve(name)

@@ -3,7 +3,8 @@
 Source: gymnasium/envs/mujoco/*_v4.py and *_v5.py, https://github.com/Farama-Foundation/Gymnasium.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -37,6 +38,13 @@ class Task(NamedTuple):
     force_limit: float = INF  # each entry of the external forces is clipped to it, in observation and cost
     max_contact_cost: float = INF
     healthy: Callable[[Array, Array], Array] | None = None  # (qpos, qvel) -> bool; where false, the episode terminates
+    # Physics -> options that suit the task, where the physics' own defaults do not.
+    options: Mapping[str, Mapping[str, int]] = MappingProxyType({})
+
+
+def _solver(iterations: int, ls_iterations: int = 3) -> Mapping[str, Mapping[str, int]]:
+    """The fewest steps of MJX's solver with which no control step is further from MuJoCo's (table: BUILD_NOTES.md)."""
+    return {"mjx": {"iterations": iterations, "ls_iterations": ls_iterations}}
 
 
 def _torso(_: Any, data: Any) -> Any:
@@ -71,32 +79,34 @@ def _humanoid_healthy(qpos: Array, qvel: Array) -> Array:
 V4 = {
     "cheetah": Task(
         "HalfCheetah-v4", "half_cheetah.xml", 5, ctrl_cost=0.1, noise=0.1, normal_velocity=True,
+        options=_solver(5),
     ),
     "walker": Task(
         "Walker2d-v4", "walker2d.xml", 4, ctrl_cost=1e-3, noise=5e-3,
-        max_speed=10.0, alive=1.0, healthy=_walker_healthy,
+        max_speed=10.0, alive=1.0, healthy=_walker_healthy, options=_solver(8),
     ),
     "ant": Task(
         "Ant-v4", "ant.xml", 5, ctrl_cost=0.5, noise=0.1, normal_velocity=True,
-        tracked=_torso, hidden=2, alive=1.0, healthy=_ant_healthy,
+        tracked=_torso, hidden=2, alive=1.0, healthy=_ant_healthy, options=_solver(7),
     ),
     "humanoid": Task(
         "Humanoid-v4", "humanoid.xml", 5, ctrl_cost=0.1, noise=1e-2,
         tracked=_center_of_mass, hidden=2, quantities=QUANTITIES,
-        forward=1.25, alive=5.0, healthy=_humanoid_healthy,
+        forward=1.25, alive=5.0, healthy=_humanoid_healthy, options=_solver(6),
     ),
     "hopper": Task(
         "Hopper-v4", "hopper.xml", 4, ctrl_cost=1e-3, noise=5e-3,
-        max_speed=10.0, alive=1.0, healthy=_hopper_healthy,
+        max_speed=10.0, alive=1.0, healthy=_hopper_healthy, options=_solver(5),
     ),
     "swimmer": Task(
-        "Swimmer-v4", "swimmer.xml", 4, ctrl_cost=1e-4, noise=0.1, hidden=2,
+        "Swimmer-v4", "swimmer.xml", 4, ctrl_cost=1e-4, noise=0.1, hidden=2, options=_solver(4),
     ),
     # The height is divided by the simulator's time step of 0.003 s.
     "humanoid_standup": Task(
         "HumanoidStandup-v4", "humanoidstandup.xml", 5, ctrl_cost=0.1, noise=1e-2,
         hidden=2, quantities=QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
         contact_cost=5e-7, max_contact_cost=10.0,
+        options=_solver(7),
     ),
 }  # fmt: skip
 

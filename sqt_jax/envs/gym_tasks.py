@@ -83,11 +83,12 @@ def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:
     """The environment of the row `name` in `TASKS`, on the named simulator with its options.
 
     Raises:
-      ValueError: the simulator is unknown.
+      ValueError: the simulator is unknown, or cannot run here.
       TypeError: it has no such option.
     """
     task = TASKS[name]
     model = load_model(task)
+    options = {**task.options.get(physics, {}), **options}
     simulator: Physics = make_physics(physics, Setup(model, task.frame_skip, task.quantities, task.tracked), **options)
     low, high = model.actuator_ctrlrange.T.astype(np.float32)
     control_step = model.opt.timestep * task.frame_skip

@@ -5,7 +5,10 @@ A task is written once over `Physics`; which simulator computes it is a name in 
 
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, NamedTuple
+
+import jax
 
 from sqt_jax.names import unknown
 from sqt_jax.types import Array, State
@@ -48,16 +51,41 @@ class Physics(NamedTuple):
 QUANTITIES = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 # name -> module with `make(setup, **options) -> Physics`, imported when first asked for
-PHYSICS = {"mjx": "sqt_jax.envs.physics.mjx", "mujoco": "sqt_jax.envs.physics.mujoco_c"}
+PHYSICS = {
+    "mjx": "sqt_jax.envs.physics.mjx",
+    "mujoco": "sqt_jax.envs.physics.mujoco_c",
+    "warp": "sqt_jax.envs.physics.mjx_warp",
+}
+
+
+def _warp_lacks() -> str:
+    if find_spec("warp") is None:
+        return "the package warp-lang (pip install -e '.[warp]')"
+    device = jax.devices()[0]
+    # a GPU of another maker is a "gpu" too
+    if device.platform != "gpu" or "cuda" not in device.client.platform_version.lower():
+        return f"an NVIDIA GPU as JAX's device, which is {device.platform}"
+    return ""
+
+
+# What a simulator needs and this machine has not, in words; asked when it is wanted, since it starts JAX.
+LACKS = {"warp": _warp_lacks}
+
+
+def lacks(name: str) -> str:
+    """What is missing here to run a simulator; empty where nothing is."""
+    return LACKS[name]() if name in LACKS else ""
 
 
 def make_physics(name: str, setup: Setup, **options: Any) -> Physics:
     """Make the simulator called `name`.
 
     Raises:
-      ValueError: the name is unknown.
+      ValueError: the name is unknown, or the simulator cannot run here.
       TypeError: the simulator has no such option.
     """
     if name not in PHYSICS:
         raise ValueError("physics " + unknown(name, PHYSICS))
+    if missing := lacks(name):
+        raise ValueError(f"physics {name} needs {missing}")
     return import_module(PHYSICS[name]).make(setup, **options)

@@ -24,7 +24,7 @@ from sqt_jax.types import Array
 _RK4_STAGE = np.array([0, 1 / 2, 1 / 2, 1], np.float32)
 _RK4_WEIGHT = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6], np.float32)
 
-_PRIVATE = ("cinert", "cfrc_ext")  # quantities that MJX 3.17 keeps under `data._impl`
+PRIVATE = ("cinert", "cfrc_ext")  # quantities that MJX 3.17 keeps under `data._impl`
 
 
 def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8) -> Physics:
@@ -32,21 +32,13 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
 
     Args:
       iterations: most steps of the constraint solver; None takes the model file's. A control step with 8 is as near to
-        MuJoCo's as one with 100.
+        MuJoCo's as one with 100; some tasks need fewer (`Task.options`).
       ls_iterations: most steps of its line search, which under `vmap` all cost time; None takes the model file's.
 
     Raises:
       ValueError: the model has activation states, or an integrator other than Euler and RK4.
     """
-    host_model = copy.copy(setup.model)
-    integrator = mujoco.mjtIntegrator(host_model.opt.integrator)
-    if host_model.na or integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
-        raise ValueError(f"{integrator.name} with {host_model.na} activation states: only Euler and RK4 with none")
-    host_model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    if iterations is not None:
-        host_model.opt.iterations = iterations
-    if ls_iterations is not None:
-        host_model.opt.ls_iterations = ls_iterations
+    host_model = newton_model(setup.model, iterations, ls_iterations)
     model = mjx.put_model(host_model, impl="jax")
     # without implicit damping, an Euler step at no acceleration only moves the positions along the velocities
     host_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
@@ -62,7 +54,7 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
 
     def quantities(data: mjx.Data) -> dict[str, Array]:
         names = setup.quantities
-        return {name: getattr(data._impl if name in _PRIVATE else data, name).reshape(-1) for name in names}
+        return {name: getattr(data._impl if name in PRIVATE else data, name).reshape(-1) for name in names}
 
     def forward(state: PhysicsState, qpos: Array, qvel: Array, control: Array) -> tuple[mjx.Data, PhysicsState]:
         """Evaluate the dynamics at (qpos, qvel); the state given back has not moved, but is measured there."""
@@ -102,11 +94,11 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
             internal=(state.internal[0], last),
         )
 
-    substep = rk4 if integrator == mujoco.mjtIntegrator.mjINT_RK4 else euler
+    substep = rk4 if host_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else euler
 
     def place(qpos: Array, qvel: Array) -> PhysicsState:
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-        with _numerics():
+        with numerics():
             # the part of `mjx.forward` that the measured quantities need; forces are zero before the first step
             data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data_at(qpos, qvel))))
             internal = (tracked(model, data), jnp.zeros(host_model.nv, jnp.float32))
@@ -115,11 +107,29 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
     def advance(state: PhysicsState, control: Array) -> PhysicsState:
         control = jnp.asarray(control, jnp.float32)
         before = position(state)
-        with _numerics():
+        with numerics():
             state = jax.lax.fori_loop(0, setup.frame_skip, lambda _, state: substep(state, control), state)
         return state._replace(displacement=position(state) - before)
 
     return Physics(place, advance)
+
+
+def newton_model(model: mujoco.MjModel, iterations: int | None, ls_iterations: int | None) -> mujoco.MjModel:
+    """A copy of the model to be solved by Newton's method, with these limits; None leaves the model's own.
+
+    Raises:
+      ValueError: the model has activation states, or an integrator other than Euler and RK4.
+    """
+    model = copy.copy(model)
+    integrator = mujoco.mjtIntegrator(model.opt.integrator)
+    if model.na or integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
+        raise ValueError(f"{integrator.name} with {model.na} activation states: only Euler and RK4 with none")
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    if iterations is not None:
+        model.opt.iterations = iterations
+    if ls_iterations is not None:
+        model.opt.ls_iterations = ls_iterations
+    return model
 
 
 def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -151,9 +161,9 @@ def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 @contextlib.contextmanager
-def _numerics() -> Iterator[None]:
-    # "highest": GPUs would multiply matrices in TF32, with 10 bits of mantissa. The other two: MJX relies on implicit
-    # promotion, whatever the program around it allows.
+def numerics() -> Iterator[None]:
+    """Full precision, and implicit promotion as MJX relies on it, whatever the program around it allows."""
+    # "highest": GPUs would multiply matrices in TF32, with 10 bits of mantissa
     with (
         jax.default_matmul_precision("highest"),
         jax.numpy_dtype_promotion("standard"),

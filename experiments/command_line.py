@@ -1,0 +1,117 @@
+"""Command lines that look at finished runs: `RUNS...` and a few flags, refused in one line.
+
+Nothing here brings JAX, so that a typing error is answered at once.
+"""
+
+import argparse
+import difflib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from experiments import files
+
+DONE, BAD_USAGE = 0, 2
+
+
+class UsageError(ValueError):
+    """A command line that cannot be. The text is one line that names the flag or the run."""
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with this repository's messages: one line, `--flag: takes ...`."""
+
+    def __init__(self, description: str, example: str):
+        super().__init__(
+            prog=example.partition(" RUNS")[0],
+            description=description,
+            epilog="RUNS are run folders, or folders above them.",
+            allow_abbrev=False,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        self.example = example
+        self.add_argument("runs", nargs="*", metavar="RUNS", help="folders of runs, or folders above them")
+
+    def read(self, argv: Sequence[str]) -> argparse.Namespace:
+        """The values of `argv`, program name first; leaves with 0 where it asks for help. Raises `UsageError`."""
+        options, unknown = self.parse_known_intermixed_args(list(argv[1:]))
+        if unknown:
+            name = unknown[0].partition("=")[0]
+            known = [flag for action in self._actions for flag in action.option_strings if flag.startswith("--")]
+            near = difflib.get_close_matches(name, known, n=1)
+            raise UsageError(
+                f"{name}: unknown flag{f'; did you mean {near[0]}?' if near else '; --help lists the flags'}"
+            )
+        if not options.runs:
+            raise UsageError(f"RUNS: takes folders of runs or folders above them, as in {self.example}")
+        return options
+
+    def error(self, message: str) -> NoReturn:
+        flag, _, rest = message.removeprefix("argument ").partition(": ")
+        if "expected one argument" in rest:
+            takes = next(action for action in self._actions if flag in action.option_strings)
+            rest = f"takes {takes.metavar}"
+        elif "ignored explicit argument" in rest:
+            rest = "is a switch and takes no value"
+        raise UsageError(f"{flag}: {rest}" if rest else message)
+
+
+def one_of(*choices: str) -> Callable[[str], str]:
+    """The type of a flag that takes one of a few words."""
+
+    def parse(text: str) -> str:
+        if text not in choices:
+            raise argparse.ArgumentTypeError(f"takes one of {', '.join(choices)}, not {text!r}")
+        return text
+
+    return parse
+
+
+def whole(text: str) -> int:
+    """The type of a flag that takes a whole number of at least 0."""
+    if not (text.isascii() and text.isdecimal()):
+        raise argparse.ArgumentTypeError(f"takes a whole number of at least 0, not {text!r}")
+    return int(text)
+
+
+def folder(text: str) -> Path:
+    """The type of a flag that takes a folder, which need not be there."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError("takes a folder")
+    return Path(text)
+
+
+def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
+    """Raises `UsageError` where files would be replaced that may not be, or `out` is no folder."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"--out={out}: takes a folder, which this is not")
+    there = [name for name in names if (out / name).exists() or (out / name).is_symlink()]
+    if there and not overwrite:
+        raise UsageError(f"--out={out}: {there[0]} is there already; takes another folder, or --overwrite replaces it")
+    for name in there:
+        if (out / name).is_dir():
+            raise UsageError(f"--out={out}: {name} is a folder; takes a folder without it")
+
+
+def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
+    """Writes whole files into `out`. Raises `UsageError` where that cannot be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            with files.whole_file(out / name) as file:
+                file.write(content)
+    except OSError as error:
+        raise UsageError(f"--out={out}: takes a folder that can be written: {error.strerror}") from None
+
+
+def guarded(command: Callable[[Sequence[str]], Any], argv: Sequence[str]) -> int:
+    """Runs a command; the exit code. A `UsageError` is one line on stderr."""
+    try:
+        command(argv)
+    except UsageError as error:
+        print("".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error)), file=sys.stderr)
+        return BAD_USAGE
+    except SystemExit as left:  # after --help
+        return left.code if isinstance(left.code, int) else BAD_USAGE
+    return DONE

@@ -1,0 +1,72 @@
+"""MuJoCo Warp through MJX: the simulator as CUDA kernels, called from the compiled program.
+
+All robots of a program (members, environments) are one call, as one batch of worlds: Warp's contacts lie in one array
+for all of them, which has room for every pair of bodies that can touch, of every robot.
+
+Needs the package warp-lang (the extra `warp`). Warp itself runs on a CPU too, slowly: good for tests.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import warp
+
+from sqt_jax.envs.physics import Physics, PhysicsState, Setup
+from sqt_jax.envs.physics.mjx import PRIVATE, mjx, newton_model, numerics
+from sqt_jax.envs.physics.mjx import make as make_mjx
+from sqt_jax.types import Array
+
+warp.config.log_level = warp.LOG_WARNING  # else it prints of each kernel that it compiles
+
+
+def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None = None) -> Physics:
+    """MJX-Warp with Newton's method, started from MJX's kinematics.
+
+    Args:
+      iterations: most steps of the constraint solver, which stops where it has converged; None takes the model file's.
+      ls_iterations: most steps of its line search; None takes the model file's.
+
+    Raises:
+      ValueError: the model has activation states, or an integrator other than Euler and RK4.
+    """
+    host_model = newton_model(setup.model, iterations, ls_iterations)
+    model = mjx.put_model(host_model, impl="warp")
+    if "cfrc_ext" in setup.quantities:
+        model = model.tree_replace({"opt._impl.run_rne_postconstraint": True})
+    largest = mjx.make_data(host_model, impl="jax")._impl  # MJX's has a row for all that can ever touch
+    num_contacts, num_rows = largest.contact.dist.shape[0], largest.efc_J.shape[0]
+
+    def advance_one(blank: mjx.Data, state: PhysicsState, control: Array) -> PhysicsState:
+        before, warm_start = state.internal
+        data = blank.replace(qpos=state.qpos, qvel=state.qvel, ctrl=control, qacc_warmstart=warm_start)
+        data = jax.lax.fori_loop(0, setup.frame_skip, lambda _, data: mjx.step(model, data), data)
+        after = data.qpos[0] if setup.tracked is None else setup.tracked(model, data)
+        quantities = {
+            name: getattr(data._impl if name in PRIVATE else data, name).reshape(-1) for name in setup.quantities
+        }
+        return PhysicsState(data.qpos, data.qvel, after - before, quantities, (after, data.qacc_warmstart))
+
+    @jax.custom_batching.custom_vmap
+    def advance_all(state: PhysicsState, control: Array) -> PhysicsState:
+        """States and controls [R, ...] of all robots."""
+        with numerics():
+            room = {"naconmax": len(control) * num_contacts, "njmax": num_rows}
+            blank = mjx.make_data(host_model, impl="warp", **room)
+            return jax.vmap(advance_one, (None, 0, 0))(blank, state, control)
+
+    @advance_all.def_vmap
+    def _(size: int, batched: Any, *arguments: Any) -> tuple[PhysicsState, Any]:
+        def flat(leaf: Array, is_batched: bool) -> Array:
+            leaf = leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
+            return leaf.reshape(-1, *leaf.shape[2:])
+
+        state = advance_all(*jax.tree.map(flat, arguments, tuple(batched)))
+        state = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), state)
+        return state, jax.tree.map(lambda _: True, state)
+
+    def advance(state: PhysicsState, control: Array) -> PhysicsState:
+        batch = jax.tree.map(lambda leaf: leaf[None], (state, jnp.asarray(control, jnp.float32)))
+        return jax.tree.map(lambda leaf: leaf[0], advance_all(*batch))
+
+    return Physics(make_mjx(setup).place, advance)

@@ -1,0 +1,68 @@
+"""Run folders written by hand: config.json and evaluations.csv, without a training."""
+
+import csv
+import json
+import math
+
+import numpy as np
+
+from experiments.records import EVALUATION_COLUMNS
+from sqt_jax.algorithms import make_config
+
+STEPS = 100  # of a made run, evaluated at 0, 50 and 100, with updates after 10
+
+
+def write_run(
+    folder, algo="td3", env="cheetah", curves=((0, 1, 2),), seeds=None, q_std=0.5, more=None, name="run", **settings
+):
+    """A run whose members have the returns `curves` [members, evaluations]; NaN is an empty field.
+
+    Args:
+      q_std: of all members and evaluations, or one per member.
+      more: further columns by name, [members, evaluations] each.
+      settings: of the run; `swept={"penalty_coef": (0.1, 0.5)}` makes the seeds times these values.
+    """
+    swept = settings.pop("swept", {})
+    versions = settings.pop("versions", {"jax": "0.10.2"})
+    settings = {"steps": STEPS, "warmup_steps": 10, "batch_size": 8, "eval_every": 50, "eval_episodes": 1} | settings
+    configs = [make_config(algo, env, **settings)]
+    if swept:
+        ((scalar, values),) = swept.items()
+        configs = [make_config(algo, env, **settings | {scalar: value}) for value in values]
+    curves = np.array(curves, float)
+    seeds = range(len(curves) // len(configs)) if seeds is None else seeds
+    members = [(config, seed) for config in configs for seed in seeds]
+    assert len(members) == len(curves)
+    path = folder / env / algo / name
+    path.mkdir(parents=True)
+    content = {
+        "settings": configs[0].flat(),
+        "preset": "paper",
+        "replay_rows": configs[0].train.capacity,
+        "evaluated_on": "mujoco",
+        "swept": list(swept),
+        "members": [
+            {"member": index, "seed": seed, "penalty_coef": config.agent.penalty_coef}
+            | {scalar: getattr(config.agent, scalar) for scalar in swept}
+            for index, (config, seed) in enumerate(members)
+        ],
+        "output": {},
+        "command": ["run"],
+        "versions": versions,
+        "resumed": [],
+    }
+    (path / "config.json").write_text(json.dumps(content))
+    q_stds = np.broadcast_to(q_std, len(members))
+    with (path / "evaluations.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*EVALUATION_COLUMNS, *(more or {})], restval="", lineterminator="\n")
+        writer.writeheader()
+        for evaluation in range(curves.shape[1]):
+            for index, (config, seed) in enumerate(members):
+                step = 50 * evaluation
+                value = curves[index, evaluation]
+                row = {"member": index, "env_steps": step, "gradient_steps": max(0, step - 10), "seed": seed}
+                row |= {"penalty_coef": config.agent.penalty_coef, "return_mean": value, "wall_seconds": step / 10}
+                row |= {"q_std": q_stds[index] if step and not math.isnan(value) else math.nan}
+                row |= {name: values[index][evaluation] for name, values in (more or {}).items()}
+                writer.writerow({name: "" if value != value else value for name, value in row.items()})
+    return path

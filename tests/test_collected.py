@@ -1,0 +1,231 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+from made_runs import write_run
+
+from experiments.collected import base_algorithm, collect, find, row_differences
+from experiments.command_line import UsageError
+from sqt_jax.algorithms import ALGORITHMS
+
+NAN = float("nan")
+
+
+def only(found):
+    (group,) = found.groups
+    return group
+
+
+def test_runs_are_found_in_and_below_folders_each_once(tmp_path):
+    one, two = write_run(tmp_path / "a"), write_run(tmp_path / "b", "sac")
+    (one / "checkpoint").mkdir()
+    shutil.copy(one / "config.json", one / "checkpoint")  # not a run of its own
+    assert find([str(tmp_path)]) == ([one, two], [])
+    assert find([str(two), str(tmp_path), f"{one}/"]) == ([two, one], [])
+
+
+def test_folders_with_evaluations_alone_are_named(tmp_path):
+    one, two = write_run(tmp_path / "a"), write_run(tmp_path / "b", "sac")
+    (two / "config.json").unlink()
+    assert find([str(tmp_path)]) == ([one], [f"left out: {two} has an evaluations.csv, but no config.json"])
+
+
+def test_seeds_of_runs_with_equal_settings_are_pooled(tmp_path):
+    write_run(tmp_path / "a", curves=[[0, 1, 5], [0, 3, 1]], seeds=[4, 2])
+    write_run(tmp_path / "b", curves=[[0, 2, 3]], seeds=[3])
+    group = only(collect([str(tmp_path)]))
+    assert group.seeds == (2, 3, 4)
+    np.testing.assert_array_equal(group.values("return_mean"), [[0, 3, 1], [0, 2, 3], [0, 1, 5]])
+    assert (group.score.mean, group.scored_at) == (3.0, 100)
+    np.testing.assert_array_equal(group.scores, [1, 3, 5])
+    assert group.notes == ()
+
+
+def test_the_same_seed_twice_is_refused(tmp_path):
+    one, two = write_run(tmp_path / "a", seeds=[3]), write_run(tmp_path / "b", seeds=[3])
+    with pytest.raises(UsageError) as error:
+        collect([str(tmp_path)])
+    message = f"{one} and {two}: both hold seed 3 of td3 on cheetah with the same settings; takes one of them"
+    assert str(error.value) == message
+
+
+def test_runs_that_differ_are_rows_of_their_own_named_by_what_differs(tmp_path):
+    write_run(tmp_path / "a")
+    write_run(tmp_path / "b", steps=200)
+    write_run(tmp_path / "c", updates_per_step=2)
+    labels = [row.label for row in collect([str(tmp_path)]).rows]
+    assert labels == [
+        "td3 (steps 100, updates_per_step 1)",
+        "td3 (steps 100, updates_per_step 2)",
+        "td3 (steps 200, updates_per_step 1)",
+    ]
+
+
+def test_a_replay_larger_than_the_run_is_no_difference_and_a_smaller_one_is(tmp_path):
+    for name, capacity in [("a", 100), ("b", 1_000_000), ("c", 50)]:
+        write_run(tmp_path / name, replay_capacity=capacity, seeds=[ord(name)])
+    rows = collect([str(tmp_path)]).rows
+    assert [row.label for row in rows] == ["td3 (replay_capacity 50)", "td3 (replay_capacity all)"]
+    assert rows[1].groups["cheetah"].seeds == (97, 98)
+
+
+def test_evaluation_on_another_physics_is_a_difference_although_both_said_auto(tmp_path):
+    write_run(tmp_path / "a")
+    other = write_run(tmp_path / "b")
+    content = json.loads((other / "config.json").read_text()) | {"evaluated_on": "mjx"}
+    (other / "config.json").write_text(json.dumps(content))
+    labels = [row.label for row in collect([str(tmp_path)]).rows]
+    assert labels == ["td3 (eval_physics mjx)", "td3 (eval_physics mujoco)"]
+
+
+def test_a_sweep_is_a_row_per_value(tmp_path):
+    curves = [[0, value, value] for value in (1, 2, 3, 4)]
+    write_run(tmp_path, "td3_sqt", curves=curves, swept={"penalty_coef": (0.1, 0.5)})
+    found = collect([str(tmp_path)])
+    assert [row.label for row in found.rows] == ["td3_sqt (penalty_coef 0.1)", "td3_sqt (penalty_coef 0.5)"]
+    assert [group.score.mean for group in found.groups] == [1.5, 3.5]
+
+
+def test_a_coefficient_per_task_is_one_row(tmp_path):
+    write_run(tmp_path, "td3_sqt", "cheetah", penalty_coef=0.5)
+    write_run(tmp_path, "td3_sqt", "ant", penalty_coef=0.25)
+    (row,) = collect([str(tmp_path)]).rows
+    assert (row.label, list(row.groups)) == ("td3_sqt", ["cheetah", "ant"])
+    assert row_differences(row) == {"penalty_coef": {"cheetah": 0.5, "ant": 0.25}}
+
+
+def test_rows_and_tasks_have_the_order_of_their_tables(tmp_path):
+    for algo, env in [("sac", "humanoid"), ("td3_sqt", "cheetah"), ("td3", "walker"), ("td3", "brax:ant")]:
+        write_run(tmp_path, algo, env)
+    found = collect([str(tmp_path)])
+    assert [row.label for row in found.rows] == ["td3", "td3_sqt", "sac"]
+    assert found.tasks == ["cheetah", "walker", "humanoid", "brax:ant"]
+
+
+def test_what_is_incomplete_says_why(tmp_path):
+    write_run(tmp_path / "a", curves=[[0, 1, 2], [0, 5, NAN]])
+    write_run(tmp_path / "b", curves=[[0, 3]], seeds=[7], versions={"jax": "0.11.0"})
+    group = only(collect([str(tmp_path)]))
+    assert group.notes == (
+        "seed 1 diverged after step 50: no evaluation after that counts",
+        "seed 7 stopped at step 50 of 100",
+        "evaluations up to step 50 count, which all its seeds have",
+        "seeds from runs with different versions: jax 0.10.2, 0.11.0",
+    )
+    assert (group.score.mean, group.scored_at) == (3.0, 50)  # of all three seeds, and of no step that one has not
+    np.testing.assert_array_equal(group.finals, [1, 5, 3])
+
+
+def test_means_over_intervals_count_what_all_seeds_measured(tmp_path):
+    bias = [[9, 1, 3], [9, 2, NAN]]
+    write_run(tmp_path, curves=[[0, 1, 2], [0, 1, 2]], q_std=[0.5, 0.75], more={"value_bias": bias})
+    group = only(collect([str(tmp_path)]))
+    np.testing.assert_array_equal(group.mean_of("q_std"), [0.5, 0.75])
+    np.testing.assert_array_equal(group.mean_of("value_bias"), [1, 2])  # not before the first update
+    assert group.mean_of("value_bias_normalised") is None
+
+
+def test_a_line_that_was_cut_off_is_no_row(tmp_path):
+    path = write_run(tmp_path, curves=[[0, 1, 2]]) / "evaluations.csv"
+    path.write_text(path.read_text().rstrip("\n")[:-3])
+    group = only(collect([str(tmp_path)]))
+    assert group.notes == ("seed 0 stopped at step 50 of 100",)
+
+
+def test_a_run_without_an_evaluation_is_left_out_and_named(tmp_path):
+    write_run(tmp_path / "a")
+    path = write_run(tmp_path / "b", "sac", curves=np.zeros((1, 0)))
+    found = collect([str(tmp_path)])
+    assert len(found.rows) == 1 and found.notes == [f"left out: {path} has no evaluation yet"]
+    with pytest.raises(UsageError, match="has no evaluation yet"):
+        collect([str(path)])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: "", "it is empty"),
+        (lambda text: text.replace("q_std", "std"), "it has no column q_std"),
+        (lambda text: text.replace("2.0", "two"), "could not convert string to float: 'two'"),
+        (lambda text: text.replace(",0.5,", ","), "line 3 has 11 fields instead of 12"),
+        (lambda text: text + text.splitlines()[-1] + "\n", "member 0 has other rows than it should"),
+        (lambda text: text.replace("0,100,90,0", "0,100,90,1"), "member 0 has other rows than it should"),
+        (lambda text: text.replace("0,100,90,0", "1,100,90,0"), "it has members that its config.json has not"),
+        (lambda text: text.replace("0,100,90,0", "0,,90,0"), "a field of env_steps is empty"),
+    ],
+)
+def test_damaged_evaluations_are_named(tmp_path, damage, message):
+    path = write_run(tmp_path, curves=[[0, 1, 2]])
+    file = path / "evaluations.csv"
+    changed = damage(file.read_text())
+    assert changed != file.read_text()
+    file.write_text(changed)
+    with pytest.raises(UsageError) as error:
+        collect([str(path)])
+    assert str(error.value) == f"{path}: its evaluations.csv is damaged: {message}"
+
+
+def test_runs_that_cannot_be_read_are_named(tmp_path):
+    path = write_run(tmp_path / "a")
+    (path / "evaluations.csv").unlink()
+    for text, message in [
+        (str(path), f"{path}: its evaluations.csv cannot be read (No such file or directory)"),
+        (str(tmp_path / "none"), "there is no such folder; RUNS takes folders of runs or folders above them"),
+        (str(path / "config.json"), "is no folder"),
+    ]:
+        with pytest.raises(UsageError) as error:
+            collect([text])
+        assert message in str(error.value) and "\n" not in str(error.value)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError, match="holds no run"):
+        collect([str(tmp_path / "empty")])
+    (path / "config.json").write_text("{}")
+    with pytest.raises(UsageError, match="config.json does not describe a run"):
+        collect([str(path)])
+
+
+def test_the_base_is_alike_in_everything_but_the_penalty(tmp_path):
+    write_run(tmp_path / "a", "td3")
+    write_run(tmp_path / "a", "td3_sqt")
+    write_run(tmp_path / "b", "sac", updates_per_step=2)
+    write_run(tmp_path / "b", "sac_sqt")
+    write_run(tmp_path / "c", "td7_sqt")
+    found = collect([str(tmp_path)])
+    td3, td3_sqt, _, sac_sqt, td7_sqt = found.groups
+    assert found.base(td3_sqt) == (td3, "")
+    assert found.base(sac_sqt) == (
+        None,
+        "not compared: sac and sac_sqt on cheetah differ in updates_per_step (2, 1)",
+    )
+    assert found.base(td7_sqt) == (None, "no run of td7 on cheetah to compare with")
+
+
+def test_coefficient_zero_stands_in_for_a_base_that_was_not_run(tmp_path):
+    write_run(tmp_path, "td3_sqt", curves=[[0, 1, 1], [0, 2, 2]], swept={"penalty_coef": (0.0, 0.5)})
+    write_run(tmp_path, "td3_sqt_tuple")
+    found = collect([str(tmp_path)])
+    zero, half, tuple_form = found.groups
+    for group in (half, tuple_form):
+        assert found.base(group).group is zero
+        assert "no run of td3: td3_sqt at penalty_coef 0, which trains the same, is its base" in found.base(group).note
+
+
+def test_counterparts(tmp_path):
+    write_run(tmp_path, "td3_sqt")
+    write_run(tmp_path / "a", "td3_sqt_tuple")
+    write_run(tmp_path / "b", "td3_sqt_tuple", gamma=0.9)
+    found = collect([str(tmp_path)])
+    (other,) = found.counterparts(found.groups[0], "td3_sqt_tuple")
+    assert other.settings["gamma"] == 0.99
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_base_of_a_name_is_its_row_without_the_penalty(algo):
+    base = ALGORITHMS[base_algorithm(algo)]
+    own = {name: value for name, value in ALGORITHMS[algo].settings.items() if not name.startswith("penalty")}
+    assert (base.make_agent, base.settings, base.training) == (
+        ALGORITHMS[algo].make_agent,
+        own,
+        ALGORITHMS[algo].training,
+    )

@@ -1,0 +1,84 @@
+import pytest
+
+from experiments import command_line
+from experiments.command_line import Parser, UsageError, folder, guarded, one_of, whole
+
+
+@pytest.fixture
+def parser():
+    made = Parser("What it does.", "python -m experiments.tables RUNS...")
+    made.add_argument("--format", type=one_of("png", "svg"), default="png", metavar="NAME")
+    made.add_argument("--seed", type=whole, default=0, metavar="N")
+    made.add_argument("--out", type=folder, metavar="FOLDER")
+    made.add_argument("--overwrite", action="store_true")
+    return made
+
+
+def test_runs_and_flags_in_any_order(parser):
+    options = parser.read(["plots", "--seed=3", "a", "--format=svg", "b", "--overwrite", "c"])
+    assert options.runs == ["a", "b", "c"]
+    assert (options.format, options.seed, options.out, options.overwrite) == ("svg", 3, None, True)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ([], "RUNS: takes folders of runs or folders above them, as in python -m experiments.tables RUNS..."),
+        (["a", "--formt=svg"], "--formt: unknown flag; did you mean --format?"),
+        (["a", "--xyz"], "--xyz: unknown flag; --help lists the flags"),
+        (["a", "--form=svg"], "--form: unknown flag; did you mean --format?"),  # no abbreviations
+        (["a", "--format=gif"], "--format: takes one of png, svg, not 'gif'"),
+        (["a", "--format"], "--format: takes NAME"),
+        (["a", "--seed=-1"], "--seed: takes a whole number of at least 0, not '-1'"),
+        (["a", "--out="], "--out: takes a folder"),
+        (["a", "--overwrite=yes"], "--overwrite: is a switch and takes no value"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_line(parser, argv, message):
+    with pytest.raises(UsageError) as error:
+        parser.read(["tables", *argv])
+    assert str(error.value) == message
+
+
+def test_exit_codes(parser, capsys):
+    def refuse(argv):
+        raise UsageError("--out=a\nb: no")
+
+    assert guarded(refuse, []) == 2
+    assert capsys.readouterr().err == "--out=a\\nb: no\n"
+    assert guarded(parser.read, ["tables", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert "What it does." in shown and "--overwrite" in shown
+    assert guarded(parser.read, ["tables", "a"]) == 0
+
+
+def test_files_are_replaced_only_where_that_is_asked_for(tmp_path):
+    out = tmp_path / "new" / "tables"
+    command_line.refuse_existing(out, ["a.csv"], overwrite=False)
+    command_line.write_files(out, {"a.csv": b"1"})
+    with pytest.raises(UsageError, match="a.csv is there already; takes another folder, or --overwrite replaces it"):
+        command_line.refuse_existing(out, ["b.csv", "a.csv"], overwrite=False)
+    command_line.refuse_existing(out, ["a.csv"], overwrite=True)
+    command_line.write_files(out, {"a.csv": b"2"})
+    assert [(path.name, path.read_bytes()) for path in out.iterdir()] == [("a.csv", b"2")]
+
+
+def test_folders_that_cannot_be_written(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("x")
+    with pytest.raises(UsageError, match="takes a folder, which this is not"):
+        command_line.refuse_existing(file, ["a.csv"], overwrite=True)
+    with pytest.raises(UsageError, match="takes a folder that can be written"):
+        command_line.write_files(file / "below", {"a.csv": b""})
+    (tmp_path / "a.csv").mkdir()
+    with pytest.raises(UsageError, match="a.csv is a folder"):
+        command_line.refuse_existing(tmp_path, ["a.csv"], overwrite=True)
+
+
+def test_a_link_is_replaced_and_not_written_through(tmp_path):
+    (tmp_path / "precious").write_text("x")
+    (tmp_path / "a.csv").symlink_to(tmp_path / "precious")
+    with pytest.raises(UsageError):
+        command_line.refuse_existing(tmp_path, ["a.csv"], overwrite=False)
+    command_line.write_files(tmp_path, {"a.csv": b"1"})
+    assert (tmp_path / "precious").read_text() == "x" and not (tmp_path / "a.csv").is_symlink()

@@ -1,0 +1,206 @@
+import numpy as np
+import pytest
+from made_runs import write_run
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+
+from experiments import figures
+from experiments.collected import collect
+from experiments.figures import ALGORITHM_COLOURS, COLOURS, FORM_LINES, draw_curves, over_time, penalty_sweep
+from experiments.records import EVALUATION_COLUMNS
+from sqt_jax.algorithms import ALGORITHMS
+
+NAN = float("nan")
+
+
+def table_of(curves, coefs, q_std=1.0):
+    """Columns of an evaluations.csv: `curves` [members, evaluations], a coefficient per member."""
+    curves = np.asarray(curves, float)
+    members, evaluations = curves.shape
+    table = {name: np.zeros(members * evaluations) for name in EVALUATION_COLUMNS}
+    table["member"] = np.repeat(np.arange(members, dtype=float), evaluations)
+    table["seed"] = table["member"]
+    table["penalty_coef"] = np.repeat(np.asarray(coefs, float), evaluations)
+    table["env_steps"] = np.tile(np.arange(evaluations) * 1000.0, members)
+    table["return_mean"] = curves.ravel()
+    table["q_std"] = np.full(members * evaluations, q_std)
+    return table
+
+
+def pixels_of(image, colour):
+    return int((np.abs(image[..., :3] - to_rgb(colour)).max(axis=-1) < 0.02).sum())
+
+
+def panels(figure):
+    return [axes for axes in figure.axes if axes.get_visible()]
+
+
+def lines_of(axes, colour):
+    return [line.get_xydata() for line in axes.lines if line.get_color() == colour]
+
+
+def legend_of(figure):
+    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
+    return [text.get_text() for legend in legends for text in legend.get_texts()]
+
+
+def luminance(colour):
+    return np.dot(to_rgb(colour), [0.2126, 0.7152, 0.0722])
+
+
+def test_each_group_is_drawn_in_its_own_colour(tmp_path):
+    draw_curves(table_of([[0, 1, 2], [1, 2, 3], [5, 4, 3]], [0.1, 0.1, 0.5]), tmp_path / "curves.png", "td3 on ant")
+    image = imread(tmp_path / "curves.png")
+    assert image.shape[1] > 1000
+    assert pixels_of(image, COLOURS[0]) > 500 and pixels_of(image, COLOURS[1]) > 500
+    assert pixels_of(image, COLOURS[2]) == 0
+
+
+@pytest.mark.parametrize("curves", [[[1.0]], [[1.0, NAN, 2.0], [2.0, 3.0, NAN]], [[NAN, NAN]]])
+def test_short_and_broken_curves_are_drawn_without_complaint(tmp_path, curves, recwarn):
+    draw_curves(table_of(curves, [0.5] * len(curves), q_std=NAN), tmp_path / "curves.png", "td3 on ant")
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
+    assert not recwarn.list
+
+
+def test_a_member_that_is_an_evaluation_short_is_drawn(tmp_path):
+    table = table_of([[0, 1, 2], [1, 2, 3]], [0.1, 0.1])
+    draw_curves({name: column[:-1] for name, column in table.items()}, tmp_path / "curves.png", "td3 on ant")
+    assert pixels_of(imread(tmp_path / "curves.png"), COLOURS[0]) > 500
+
+
+def test_every_algorithm_has_a_colour_and_a_line_of_its_own():
+    assert {*ALGORITHM_COLOURS} == {*ALGORITHMS}
+    assert len({*ALGORITHM_COLOURS.values()}) == len(ALGORITHM_COLOURS)
+    for base in ("td3", "sac", "td7"):  # in grey, a form is lighter than its base
+        shades = [luminance(ALGORITHM_COLOURS[base + form]) for form in FORM_LINES]
+        assert shades == sorted(shades) and np.diff(shades).min() > 0.08
+
+
+def test_a_row_has_the_same_style_whatever_stands_beside_it(tmp_path):
+    write_run(tmp_path / "a", "sac_sqt")
+    write_run(tmp_path / "b", "td3")
+    both, one = collect([str(tmp_path)]), collect([str(tmp_path / "a")])
+    style = figures.styles(both.rows)["sac_sqt"]
+    assert figures.styles(one.rows)["sac_sqt"] == style
+    assert style == (ALGORITHM_COLOURS["sac_sqt"], FORM_LINES["_sqt"], "")
+
+
+def test_coefficients_of_an_algorithm_are_shades_with_markers(tmp_path):
+    write_run(tmp_path, "td3_sqt", curves=[[0, 1]] * 3, swept={"penalty_coef": (0.1, 0.5, 1.0)})
+    found = list(figures.styles(collect([str(tmp_path)]).rows).values())
+    shades = [luminance(style.colour) for style in found]
+    assert shades == sorted(shades, reverse=True) and len({style.marker for style in found}) == 3
+
+
+@pytest.mark.parametrize(("statistic", "middle"), [("iqm", [0, 2, 4]), ("mean", [0, 4, 4.4])])
+def test_a_curve_is_the_statistic_at_each_evaluation_and_its_band_the_interval(tmp_path, statistic, middle):
+    write_run(tmp_path, curves=[[0, 1, 2], [0, 1, 3], [0, 2, 4], [0, 3, 5], [0, 13, 8]])
+    figure = over_time(collect([str(tmp_path)]), "return_mean", statistic)
+    (axes,) = panels(figure)
+    (line,) = lines_of(axes, ALGORITHM_COLOURS["td3"])
+    np.testing.assert_allclose(line, np.transpose([[0, 50, 100], middle]))
+    (band,) = axes.collections
+    edges = band.get_paths()[0].vertices
+    assert edges[:, 1].min() == 0 and 5 <= edges[:, 1].max() <= 13
+    assert axes.get_title() == "cheetah" and legend_of(figure) == ["td3"]
+    assert {"iqm": "interquartile mean", "mean": "mean"}[statistic] in figure.get_suptitle()
+
+
+def test_a_seed_alone_has_no_band_and_a_diverged_one_ends_the_line(tmp_path):
+    write_run(tmp_path / "a", "td3")
+    write_run(tmp_path / "b", "sac", curves=[[0, 1, 2], [0, 1, NAN]])
+    figure = over_time(collect([str(tmp_path)]), "return_mean", "iqm")
+    (axes,) = panels(figure)
+    assert len(axes.collections) == 1  # SAC's
+    (line,) = lines_of(axes, ALGORITHM_COLOURS["sac"])
+    assert line[:, 0].tolist() == [0, 50]
+    assert legend_of(figure) == ["td3", "sac *"]
+    assert "* sac on cheetah: seed 1 diverged after step 50" in figure.get_supxlabel()
+
+
+def test_few_algorithms_share_a_panel_per_task_and_many_have_one_per_family(tmp_path):
+    algos = [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))]
+    for algo in algos:
+        for env in ("cheetah", "ant"):
+            write_run(tmp_path / base(algo), algo, env)
+    many = over_time(collect([str(tmp_path)]), "return_mean", "iqm")
+    assert len(panels(many)) == 6 and sorted(legend_of(many)) == sorted(algos)
+    few = over_time(collect([str(tmp_path / "td3"), str(tmp_path / "sac")]), "return_mean", "iqm")
+    assert [axes.get_title() for axes in panels(few)] == ["cheetah", "ant"] and len(legend_of(few)) == 6
+
+
+def base(algo):
+    return algo.partition("_")[0]
+
+
+def test_many_tasks_go_on_in_the_next_row(tmp_path):
+    for env in ("cheetah", "walker", "ant", "humanoid", "hopper"):
+        write_run(tmp_path, env=env)
+    figure = over_time(collect([str(tmp_path)]), "return_mean", "iqm")
+    assert [axes.get_title() for axes in panels(figure)] == ["cheetah", "walker", "ant", "humanoid", "hopper"]
+
+
+def test_what_was_not_measured_has_no_figure(tmp_path):
+    write_run(tmp_path / "a", "td3", more={"value_bias": [[NAN, 2, 3]]})
+    write_run(tmp_path / "b", "sac")
+    runs = collect([str(tmp_path)])
+    assert legend_of(over_time(runs, "value_bias", "iqm")) == ["td3"]
+    assert over_time(runs, "value_bias_normalised", "iqm") is None
+    assert penalty_sweep(runs, "iqm") is None
+
+
+def test_a_sweep_has_a_dot_per_seed_and_the_base_at_nothing(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 0, 5], [0, 0, 7]])
+    curves = [[0, 0, value] for value in (1, 3, 2, 4)]
+    write_run(tmp_path, "td3_sqt", curves=curves, swept={"penalty_coef": (0.25, 0.5)})
+    figure = penalty_sweep(collect([str(tmp_path)]), "mean")
+    (axes,) = panels(figure)
+    assert [scatter.get_offsets()[:, 1].tolist() for scatter in axes.collections] == [[5, 7], [1, 3], [2, 4]]
+    (line,) = [line for line in lines_of(axes, ALGORITHM_COLOURS["td3_sqt"]) if len(line) == 3]
+    np.testing.assert_allclose(line, [[0, 6], [1, 2], [2, 3]])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.25", "0.5"]
+    assert legend_of(figure) == ["td3", "td3_sqt"]
+
+
+def test_sweeps_of_one_base_draw_it_once(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 0, 5]])
+    for algo in ("td3_sqt", "td3_sqt_tuple"):
+        write_run(tmp_path, algo, curves=[[0, 0, 1], [0, 0, 2]], swept={"penalty_coef": (0.25, 0.5)})
+    (axes,) = panels(penalty_sweep(collect([str(tmp_path)]), "mean"))
+    assert sum(scatter.get_offsets()[:, 1].tolist() == [5] for scatter in axes.collections) == 1
+    assert len(axes.collections) == 5
+
+
+@pytest.mark.parametrize("other", [{"steps": 200}, {"tau": 0.1}])
+def test_coefficients_of_runs_that_differ_otherwise_are_no_sweep(tmp_path, other):
+    write_run(tmp_path / "a", "td3_sqt", penalty_coef=0.1)
+    write_run(tmp_path / "b", "td3_sqt", penalty_coef=0.5, **other)
+    assert penalty_sweep(collect([str(tmp_path)]), "mean") is None
+
+
+def test_profile_by_hand(tmp_path):
+    # Against the best mean, 10: half of td3's seeds lie above 0.5, and half of sac's above 1.
+    write_run(tmp_path, "td3", curves=[[0, 0, 4], [0, 0, 8]])
+    write_run(tmp_path, "sac", curves=[[0, 0, 5], [0, 0, 15]])
+    write_run(tmp_path, "td7", curves=[[NAN, NAN, NAN]])
+    figure = figures.performance_profile(collect([str(tmp_path)]))
+    (axes,) = panels(figure)
+    for algo, steps in {"td3": [(0.39, 1), (0.5, 0.5), (0.81, 0)], "sac": [(0.45, 1), (1, 0.5), (1.51, 0)]}.items():
+        (line,) = lines_of(axes, ALGORITHM_COLOURS[algo])
+        for threshold, share in steps:
+            assert line[np.argmin(np.abs(line[:, 0] - threshold)), 1] == share
+    assert legend_of(figure) == ["td3", "sac"]
+    assert "left out: td7, which has no score on cheetah" in figure.get_supxlabel()
+
+
+def test_a_profile_of_nothing(tmp_path):
+    write_run(tmp_path, curves=[[-3, -2, -1]])
+    assert figures.performance_profile(collect([str(tmp_path)])) is None
+
+
+@pytest.mark.parametrize(("kind", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_images(tmp_path, kind, start):
+    write_run(tmp_path)
+    figure = over_time(collect([str(tmp_path)]), "q_std", "iqm")
+    assert figures.image(figure, kind).startswith(start)

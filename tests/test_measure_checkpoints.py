@@ -1,0 +1,23 @@
+from experiments import measure_checkpoints
+
+
+def test_a_checkpoint_is_timed_as_a_whole_in_part_and_as_training_feels_it(monkeypatch):
+    monkeypatch.setattr(measure_checkpoints, "FILLED", 40)
+    monkeypatch.setattr(measure_checkpoints, "SINCE", 10)
+    monkeypatch.setattr(
+        measure_checkpoints.algorithms, "make_config", small(measure_checkpoints.algorithms.make_config)
+    )
+    rows = list(measure_checkpoints.bench_checkpoint("td3", "hopper", 2, 1))
+    assert [row.what for row in rows] == [
+        "td3, hopper, all 40 rows, 0 MB",
+        "td3, hopper, 10 new rows",
+        "td3, hopper, 10 new rows, until training goes on",
+    ]
+    assert all(row.rate > 0 and row.members == 2 for row in rows)
+    assert rows[2].rate >= rows[1].rate
+
+
+def small(make_config):
+    return lambda *names, **settings: make_config(
+        *names, **settings | {"hidden": (8, 8), "batch_size": 8, "steps": 40, "warmup_steps": 10}
+    )

@@ -1,0 +1,150 @@
+"""From a command line to a run: which one --resume goes on with, and which of its own flags it takes over."""
+
+import json
+
+import probe_envs
+import pytest
+
+from experiments import described, flags
+from experiments.plan import make_plan
+
+NEW = (
+    "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
+    "--batch_size=8 --hidden=8,8"
+)
+
+
+def plan(out, *arguments, new=NEW):
+    options = flags.parse(["run", *new.split(), *([f"--out={out}"] if new else []), *arguments])
+    return make_plan(options, probe_envs.constant_reward())
+
+
+def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", **output):
+    """A run that has written its config.json."""
+    made = plan(out, f"--name={name}", *arguments)
+    made.path.mkdir(parents=True)
+    content = described.describe(made.members, made.swept, ["run"], made.options.preset, made.output | output)
+    described.write(made.path, content | {"started": started})
+    return made.path
+
+
+def test_a_new_run_has_a_folder_of_its_own(tmp_path):
+    made = plan(tmp_path, "--penalty_coef=0,0.5", "--name=a")
+    assert made.path == tmp_path / "ant" / "sac_sqt" / "a" and made.resumed is None
+    assert [(member.seed, member.config.agent.penalty_coef) for member in made.members] == [
+        (3, 0.0),
+        (1, 0.0),
+        (3, 0.5),
+        (1, 0.5),
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resume_alone_finds_the_latest_run_of_the_same_settings(tmp_path):
+    begun(tmp_path, "c_old", started="2025-01-01T00:00:00+00:00")
+    latest = begun(tmp_path, "b_new", started="2025-03-01T00:00:00+00:00")
+    begun(tmp_path, "a_between", started="2025-02-01T00:00:00+00:00")
+    begun(tmp_path, "other_lr", "--lr=0.5", started="2025-04-01T00:00:00+00:00")
+    begun(tmp_path, "other_seeds", "--seeds=3", started="2025-04-01T00:00:00+00:00")
+    begun(tmp_path, "more_steps", "--steps=80", started="2025-04-01T00:00:00+00:00")
+    begun(tmp_path, "damaged", started="2025-04-01T00:00:00+00:00").joinpath("config.json").write_text("{")
+    (tmp_path / "ant" / "sac_sqt" / "nothing").mkdir()
+    (tmp_path / "ant" / "sac_sqt" / "file").write_text("")
+    made = plan(tmp_path, "--resume")
+    assert made.path == latest and made.resumed.content["started"].startswith("2025-03")
+
+
+@pytest.mark.parametrize("sweep", ["--lr=1e-3,1e-4", "--penalty_coef=0.1,0.2", "--temperature=0.1"])
+def test_resume_alone_tells_sweeps_apart(tmp_path, sweep):
+    path = begun(tmp_path, "swept", sweep)
+    begun(tmp_path, "plain", started="2026-01-01T00:00:00+00:00")
+    assert plan(tmp_path, "--resume", sweep).path == path
+    with pytest.raises(flags.UsageError, match="^--resume: there is no run of these settings"):
+        plan(tmp_path, "--resume", sweep, "--seeds=9")
+
+
+def test_with_a_name_resume_takes_that_run(tmp_path):
+    path = begun(tmp_path, "a")
+    begun(tmp_path, "b", started="2026-01-01T00:00:00+00:00")
+    made = plan(tmp_path, "--resume", "--name=a")
+    assert made.path == path and made.resumed
+
+
+def test_with_a_name_that_no_run_has_resume_begins_one(tmp_path):
+    begun(tmp_path, "a")
+    made = plan(tmp_path, "--resume", "--name=b")
+    assert made.path.name == "b" and made.resumed is None and not made.path.exists()
+
+
+def test_with_the_name_of_a_folder_that_is_no_run_resume_is_refused(tmp_path):
+    path = tmp_path / "ant" / "sac_sqt" / "a"
+    path.mkdir(parents=True)
+    (path / "mine").write_text("")
+    with pytest.raises(flags.UsageError, match="already holds a run"):
+        plan(tmp_path, "--resume", "--name=a")
+
+
+def test_a_run_may_get_more_steps_and_keeps_its_replay(tmp_path):
+    path = begun(tmp_path, "a", "--penalty_coef=0,0.5", "--num_envs=2")
+    for arguments, new in ((["--resume", "--penalty_coef=0,0.5", "--num_envs=2"], NEW), ([f"--resume={path}"], "")):
+        made = plan(tmp_path, *arguments, "--steps=1000", new=new)
+        assert made.path == path
+        assert {member.config.train.steps for member in made.members} == {1000}
+        assert {member.config.train.capacity for member in made.members} == {60} == {made.train.capacity}
+        assert [(member.seed, member.config.agent.penalty_coef) for member in made.members] == [
+            (3, 0.0),
+            (1, 0.0),
+            (3, 0.5),
+            (1, 0.5),
+        ]
+
+
+def test_a_folder_says_what_run_it_is(tmp_path):
+    path = begun(tmp_path, "a", "--lr=1e-3,1e-4")
+    made, new = plan(tmp_path, f"--resume={path}", new=""), plan(tmp_path, "--lr=1e-3,1e-4", "--name=b")
+    for one, other in zip(made.members, new.members, strict=True):
+        assert (one.seed, one.config.agent, one.config.env) == (other.seed, other.config.agent, other.config.env)
+    assert (made.swept, made.train.capacity, made.train.steps) == (["lr"], new.train.capacity, 60)
+    again = plan(tmp_path, f"--resume={path}", "--algo=sac_sqt", "--env=Ant-v4", "--hidden=8,8", new="")
+    assert again.members == made.members
+
+
+DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2}
+
+
+@pytest.mark.parametrize(
+    ("its", "given", "expected"),
+    [
+        ({}, [], {}),
+        ({}, ["--checkpoint_every=0", "--notensorboard"], {"checkpoint_every": 0, "tensorboard": False}),
+        ({"checkpoint_every": 20, "tensorboard": False}, [], {"checkpoint_every": 20, "tensorboard": False}),
+        ({"checkpoint_every": 0, "keep_checkpoints": 5}, [], {"checkpoint_every": 0, "keep_checkpoints": 5}),
+        ({"checkpoint_every": 20}, ["--checkpoint_every=40"], {"checkpoint_every": 40}),
+        ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
+        # What no command line could have given counts as not there.
+        ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
+        ({"checkpoint_every": "often", "keep_checkpoints": True, "tensorboard": None, "more": 1}, [], {}),
+    ],
+    ids=lambda value: str(value) if isinstance(value, list) else "",
+)
+def test_given_flags_win_over_the_runs_and_these_over_the_defaults(tmp_path, its, given, expected):
+    path = begun(tmp_path, "a", **its)
+    assert plan(tmp_path, f"--resume={path}", *given, new="").output == DEFAULTS | expected
+
+
+def test_the_default_checkpoints_fit_the_environments(tmp_path):
+    made = plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--name=a")
+    assert made.output["checkpoint_every"] == 24_999
+    with pytest.raises(flags.UsageError, match=r"^--checkpoint_every: takes a multiple of num_envs \(3\), not 20$"):
+        plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--checkpoint_every=20", "--name=a")
+
+
+def test_a_run_that_is_in_the_way_is_refused_unless_it_is_to_be_replaced(tmp_path):
+    path = begun(tmp_path, "a")
+    with pytest.raises(flags.UsageError, match="^--name=a: .* takes another name, or --overwrite replaces it$"):
+        plan(tmp_path, "--name=a")
+    assert plan(tmp_path, "--name=a", "--overwrite").path == path
+    assert json.loads((path / "config.json").read_text())["preset"] == "paper"  # a plan removes nothing
+    (path / "mine").write_text("")
+    with pytest.raises(flags.UsageError, match="^--overwrite: .* holds other things than a run"):
+        plan(tmp_path, "--name=a", "--overwrite")

@@ -1,0 +1,49 @@
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import published
+
+ROOT = Path(__file__).parent.parent
+
+
+def figures(algo, env, source):
+    return [f for f in published.scores() if (f.algo, f.env) == (algo, env) and source in f.source]
+
+
+def test_figures_have_their_environment_version_and_source():
+    (figure,) = figures("td3", "cheetah", "TD3 paper")
+    assert (figure.value, figure.std, figure.seeds, figure.env_version) == (9637, None, "10", "v1")
+    (figure,) = figures("td7_sqt", "humanoid", "released")
+    assert (figure.value, figure.std, figure.env_version, figure.updates_per_step) == (8144.7, 354.1, "Gym v2", "2")
+    (figure,) = figures("sac_sqt", "humanoid", "SQT paper")
+    assert (figure.value, figure.env_version) == (5700, "version not stated")
+    for figure in published.scores():
+        assert figure.source and figure.env_version and np.isfinite(figure.value)
+
+
+@pytest.mark.parametrize(("env", "notes"), [("cheetah", 0), ("ant", 1), ("humanoid", 2)])
+def test_the_faults_of_the_archive_go_with_its_figures(env, notes):
+    (figure,) = figures("td3", env, "released")
+    assert len(figure.notes) == notes
+
+
+def test_the_fault_that_the_papers_figure_has():
+    (figure,) = figures("td3", "humanoid", "SQT paper")
+    assert figure.notes == (published.NEVER_LEARNS,)
+    seeds = json.loads((published.FOLDER / "released_2023_scores.json").read_text())["humanoid"]["td3"]["max_per_seed"]
+    assert seeds[2] < 361
+    assert figures("td3_sqt", "humanoid", "SQT paper")[0].notes == ()
+
+
+def test_q_stds():
+    assert {figure.algo: figure.value for figure in published.q_stds()} == {"td3": 0.93, "td3_sqt": 2.11}
+
+
+def test_the_data_are_installed_with_the_package():
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["experiments"]
+    matched = {path for pattern in patterns for path in (ROOT / "experiments").glob(pattern)}
+    assert matched == {*published.FOLDER.iterdir()}

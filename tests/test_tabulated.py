@@ -1,0 +1,228 @@
+import pytest
+from made_runs import write_run
+
+from experiments import published, tabulated
+from experiments.collected import collect
+from experiments.tabulated import make_tables, number, table_1, table_2, table_3, table_4
+
+NAN = float("nan")
+
+
+def cells(table):
+    """Rows of text, a cell's lines joined by |, its marks in brackets."""
+    return [
+        ["|".join(cell.lines) + (f" {list(cell.marks)}" if cell.marks else "") for cell in line.cells]
+        for lines in table.sections
+        for line in lines
+    ]
+
+
+def named(tables, name):
+    return next(table for table in tables if table.name == name)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(4275.4, "4,275"), (65.34, "65.3"), (-0.861, "-0.86"), (100.0, "100"), (None, "-"), (NAN, "-")],
+)
+def test_numbers(value, text):
+    assert number(value) == text
+
+
+def test_table_1_by_hand():
+    sizes = [{"env": "ant", "task": "Ant-v4", "observation": 27, "action": 8, "episode_steps": 1000}]
+    assert cells(table_1(sizes, reference=False)) == [["ant", "Ant-v4", "27", "8", "1,000"]]
+    table = table_1(sizes, reference=True)
+    assert cells(table) == [["ant", "Ant-v4", "27", "8", "1,000", "27 / 8"]]
+    assert table.records == [sizes[0] | {"paper_observation": 27, "paper_action": 8}]
+
+
+def test_the_sizes_are_the_environments(tmp_path):
+    write_run(tmp_path, env="hopper")
+    sizes = {row["env"]: (row["observation"], row["action"]) for row in tabulated.task_sizes(collect([str(tmp_path)]))}
+    theirs = {env: tuple(size) for env, size in published.paper()["table1_obs_action"].items()}
+    assert sizes == theirs | {"hopper": (11, 3)}
+
+
+def test_table_2_by_hand(tmp_path):
+    # Means 0, 5, 4: the score is that of step 50, where the seeds are 4 and 6.
+    write_run(tmp_path, "td3", curves=[[0, 4, 6], [0, 6, 2]])
+    table = table_2(collect([str(tmp_path)]), reference=False)
+    assert table.header == ["algorithm", "cheetah", "penalty_coef", "steps", "UTD"]
+    assert cells(table) == [["td3", "5.00 ± 1.00 (2)|5.00 [4.00, 6.00]", "-", "100", "1"]]
+    assert table.notes == []
+    (record,) = table.records
+    numbers = {"mean": 5, "std": 1, "iqm": 5, "mean_low": 4, "mean_high": 6, "iqm_low": 4, "iqm_high": 6}
+    where = {"algo": "td3", "env": "cheetah", "quantity": "score", "score_env_steps": 50, "per_seed": "4 6"}
+    final = {"final_mean": 4, "final_std": 2, "final_iqm": 4}
+    protocol = {"steps": 100, "updates_per_step": 1, "physics": "mjx", "eval_physics": "mujoco", "seeds": "0 1"}
+    for name, value in (numbers | where | final | protocol | {"notes": ""}).items():
+        assert record[name] == value, name
+
+
+def test_incomplete_cells_are_marked_and_missing_ones_not_filled(tmp_path):
+    write_run(tmp_path, "td3", "cheetah", curves=[[0, 1, 2], [0, 1, 2], [0, 1, 2]])
+    write_run(tmp_path, "td3", "ant", curves=[[0, 1, 2], [0, 1, NAN], [0, 1, 2]])
+    write_run(tmp_path, "sac", "cheetah", curves=[[0, 3]])
+    table = table_2(collect([str(tmp_path)]), reference=False)
+    assert cells(table) == [
+        ["td3", "2.00 ± 0.00 (3)|2.00 [2.00, 2.00]", "1.00 ± 0.00 (3)|1.00 [1.00, 1.00] [1]", "-", "100", "1"],
+        ["sac", "3.00 ± 0.00 (1) [2, 3]", "- [4]", "-", "100", "1"],
+    ]
+    assert table.notes == [
+        "seed 1 diverged after step 50: no evaluation after that counts",
+        "seed 0 stopped at step 50 of 100",
+        "fewer seeds than other cells, which have 3",
+        "no such run",
+    ]
+    assert [record["env"] for record in table.records] == ["cheetah", "ant", "cheetah"]
+
+
+def test_a_cell_without_an_evaluation_of_all_seeds(tmp_path):
+    write_run(tmp_path, curves=[[NAN, NAN]])
+    table = table_2(collect([str(tmp_path)]), reference=False)
+    assert cells(table)[0][1].startswith("- [")
+    assert "no evaluation that all its seeds have" in table.notes
+
+
+def test_what_a_rows_tasks_do_not_share_is_said(tmp_path):
+    write_run(tmp_path, "td3_sqt", "cheetah", penalty_coef=0.5)
+    write_run(tmp_path, "td3_sqt", "ant", penalty_coef=0.25, steps=200, physics="mujoco")
+    table = table_2(collect([str(tmp_path)]), reference=False)
+    assert cells(table)[0][0] == "td3_sqt [1]" and cells(table)[0][-3:] == ["0.5 / 0.25", "100 / 200", "1"]
+    assert table.notes[0] == "penalty_coef: 0.5 (cheetah), 0.25 (ant)"
+    assert "physics is mjx, but mujoco for td3_sqt on ant." in table.caption
+    assert "Common to all: warmup_steps 10, eval_physics mujoco" in table.caption
+
+
+def test_improvement_by_hand(tmp_path):
+    write_run(tmp_path, "td3", "cheetah", curves=[[0, 0, 10], [0, 0, 20]])
+    write_run(tmp_path, "td3_sqt", "cheetah", curves=[[0, 0, 18], [0, 0, 18]])
+    write_run(tmp_path, "td3", "ant", curves=[[0, 0, 4], [0, 0, 4]])
+    write_run(tmp_path, "td3_sqt", "ant", curves=[[0, 0, 3], [0, 0, 5]])
+    table = named(make_tables(collect([str(tmp_path)])), "table2_improvement")
+    ((label, cheetah, ant, over, chance),) = cells(table)
+    assert label == "td3_sqt against td3"
+    # 18 against a mean of 15, drawn from 10 to 20; it exceeds one of two.
+    assert cheetah == "+20.0 % [-10.0, 80.0]|P 0.50 [0.00, 1.00]"
+    assert ant == "+0.00 % [-25.0, 25.0]|P 0.50 [0.00, 1.00]"
+    assert over.startswith("+10.0 % [") and chance.startswith("P 0.50 [")
+    assert [record["env"] for record in table.records] == ["cheetah", "ant", "mean over tasks"]
+    assert table.records[-1]["improvement_percent"] == pytest.approx(10)
+
+
+def test_improvement_over_a_base_that_lost_or_is_not_there(tmp_path):
+    write_run(tmp_path, "td3", curves=[[-5, -2, -4]])
+    write_run(tmp_path, "td3_sqt", curves=[[0, 1, 2]])
+    write_run(tmp_path, "sac_sqt")
+    table = named(make_tables(collect([str(tmp_path)])), "table2_improvement")
+    assert cells(table) == [["td3_sqt against td3", "-|P 1.00 [1]"], ["sac_sqt against sac", "- [2]"]]
+    assert table.notes == [
+        "no percentage: the other mean is not positive",
+        "no run of sac on cheetah to compare with",
+    ]
+
+
+def test_a_percentage_without_an_interval_says_why(tmp_path):
+    write_run(tmp_path, "td3", curves=[[-9, -9, 5], [-9, -9, -1]])
+    write_run(tmp_path, "td3_sqt", curves=[[0, 1, 3], [0, 1, 3]])
+    table = named(make_tables(collect([str(tmp_path)])), "table2_improvement")
+    assert cells(table) == [["td3_sqt against td3", "+50.0 %|P 0.50 [0.00, 1.00] [1]"]]
+    assert table.notes == ["no interval of the percentage: the other mean is not positive in some resamples"]
+
+
+def test_a_comparison_says_which_of_the_two_is_incomplete(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 1]])
+    write_run(tmp_path, "td3_sqt", curves=[[0, 2, 3]])
+    table = named(make_tables(collect([str(tmp_path)])), "table2_improvement")
+    assert table.notes == ["td3 on cheetah: seed 0 stopped at step 50 of 100"]
+
+
+def test_table_3_by_hand(tmp_path):
+    bias = {"value_bias": [[9, 2, 4], [9, -1, 1]], "value_bias_normalised": [[NAN, 0.5, 0.5], [NAN, 0.25, 0.75]]}
+    write_run(tmp_path, "td3", curves=[[0, 1, 2], [0, 1, 2]], q_std=[0.5, 0.75], more=bias)
+    write_run(tmp_path, "td3_sqt", curves=[[0, 1, 2], [0, 1, 2]], q_std=[0.25, 0.25])
+    runs = collect([str(tmp_path)])
+    table = table_3(runs, reference=False)
+    assert [row[1] for row in cells(table)] == [
+        "0.62 ± 0.12 (2)|0.62 [0.50, 0.75]|bias +1.50 ± 1.50",
+        "0.25 ± 0.00 (2)|0.25 [0.25, 0.25]",
+    ]
+    assert table.records[0]["value_bias_mean"] == 1.5 and table.records[0]["value_bias_per_seed"] == "3 0"
+    assert table.records[0]["value_bias_normalised_mean"] == 0.5
+    change = named(make_tables(runs), "table3_change")
+    assert cells(change)[0][1].startswith("-60.0 % [")
+
+
+def test_table_4_by_hand(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 0, 1]])
+    write_run(tmp_path, "td3_sqt", curves=[[0, 0, 12]])
+    write_run(tmp_path, "td3_sqt_tuple", curves=[[0, 0, 10]])
+    write_run(tmp_path, "sac_sqt", curves=[[0, 0, 3]])  # without its counterpart
+    table = table_4(collect([str(tmp_path)]), reference=False)
+    assert [row[:2] for row in cells(table)] == [
+        ["td3_sqt", "12.0 ± 0.00 (1)"],
+        ["td3_sqt_tuple", "10.0 ± 0.00 (1)"],
+        ["td3_sqt against td3_sqt_tuple", "+20.0 %|P 1.00"],
+    ]
+
+
+def test_forms_that_differ_in_more_than_the_penalty_are_not_compared(tmp_path):
+    write_run(tmp_path, "td3_sqt")
+    write_run(tmp_path, "td3_sqt_tuple", tau=0.1)
+    table = table_4(collect([str(tmp_path)]), reference=False)
+    assert cells(table)[-1][:2] == ["td3_sqt against td3_sqt_tuple", "- [1]"]
+    assert table.notes == ["not compared: td3_sqt and td3_sqt_tuple on cheetah differ in tau (0.005, 0.1)"]
+
+
+def test_tables_with_nothing_in_them_are_not_made(tmp_path):
+    write_run(tmp_path, "td3")
+    names = [table.name for table in make_tables(collect([str(tmp_path)]))]
+    assert names == ["table2", "table3", "seeds"]
+
+
+def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
+    write_run(tmp_path, "td3_sqt", "humanoid", curves=[[0, 1, 2]])
+    write_run(tmp_path, "sac", "ant-v5")
+    runs = collect([str(tmp_path)])
+    table = table_2(runs, reference=True)
+    rows = [row for row in cells(table)]
+    assert table.header[1:3] == ["humanoid", "ant-v5"]
+    labels = [row[0] for row in rows]
+    # Those of the base, though we have no run of it; then ours and its own.
+    assert labels[0].startswith("published: td3, environment v3, 10 seeds|Tianshou")
+    ours = labels.index("td3_sqt")
+    released = rows[ours + 1]
+    assert released[0] == f"published: td3_sqt, environment Gym v2, 5 seeds|{published.RELEASED}"
+    assert released[1:] == ["6,648 ± 553", "-", "-", "1,000,000", "2"]  # v2's are not v5's
+    (broken,) = [row for row in rows if row[0] == released[0].replace("td3_sqt", "td3")]
+    assert broken[1] == "5,043 ± 2,383 [1, 2]" and published.NEVER_LEARNS in table.notes
+    sources = [record["source"] for record in table.records]
+    assert sources.count("") == 2 and published.PAPER in sources
+    q_std = cells(table_3(runs, reference=True))
+    assert [row[1] for row in q_std if "published: td3_sqt" in row[0]] == ["2.11"]
+
+
+def test_the_papers_mean_improvements_are_shown_where_the_algorithm_is(tmp_path):
+    for algo in ("td3", "td3_sqt", "sac"):
+        write_run(tmp_path, algo)
+    tables = make_tables(collect([str(tmp_path)]), reference=True)
+    rows = cells(named(tables, "table2_improvement"))
+    assert [row[-2] for row in rows if "published" in row[0]] == ["+21.6 %"]
+    rows = cells(named(tables, "table3_change"))
+    assert [row[-2] for row in rows if "published" in row[0]] == ["+35.4 %"]
+
+
+def test_nothing_published_is_said(tmp_path):
+    write_run(tmp_path, "redq", "brax:ant")
+    table = table_2(collect([str(tmp_path)]), reference=True)
+    assert table.caption.endswith("Nothing published is known for these algorithms and tasks.")
+
+
+def test_seeds_by_hand(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 4, 9], [0, 6, NAN]], seeds=[3, 5], q_std=[0.5, 0.75])
+    table = tabulated.seeds_table(collect([str(tmp_path)]))
+    assert cells(table) == [["td3 [1]", "cheetah", "3: 4.00  5: 6.00", "3: 9.00  5: -", "3: 0.50  5: 0.75"]]
+    first, second = table.records
+    assert (first["seed"], first["return_at_score"], first["best_return"], first["best_env_steps"]) == (3, 4, 9, 100)
+    assert (second["best_return"], second["q_std"]) == (6, 0.75) and second["run"].endswith("cheetah/td3/run")
