@@ -4,11 +4,9 @@ Exit codes: 0 done; 2 bad usage (one line, nothing written).
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from experiments import command_line
 from experiments.command_line import Parser, folder, guarded, one_of
@@ -20,13 +18,6 @@ against penalty_coef, and performance profiles; each where there is something to
 `python -m experiments.tables`."""
 FORMATS = ("png", "svg", "pdf")
 STATISTICS = ("iqm", "mean")
-
-
-def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None:
-    """Writes the curves of one run as a PNG: `figures.draw_curves`."""
-    from experiments import figures  # brings matplotlib
-
-    figures.draw_curves(table, path, title)
 
 
 def parser() -> Parser:
