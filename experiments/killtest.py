@@ -35,7 +35,7 @@ TASKS = ("tiny", "ant")
 # The replay's ring goes round, and one checkpoint alone is kept.
 COMMON = "--seeds=0,1 --hidden=16,16 --batch_size=16 --replay_capacity=100 --keep_checkpoints=1 --quiet --name=run"
 SETTINGS = {
-    "tiny": "--steps=240 --warmup_steps=40 --eval_every=70 --eval_episodes=2 --checkpoint_every=20",
+    "tiny": "--steps=160 --warmup_steps=40 --eval_every=70 --eval_episodes=2 --checkpoint_every=20",
     "ant": "--steps=240 --warmup_steps=40 --eval_every=100 --eval_episodes=1 --checkpoint_every=40",
 }
 DEADLINE = 600  # seconds for one process

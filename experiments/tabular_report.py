@@ -16,7 +16,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy import stats
 
 from experiments import contraction, mdps
-from experiments.plots import COLOURS
+from experiments.figures import COLOURS
 from experiments.tabular_agents import Algorithm, Record
 
 ROUNDING = 1e-4  # what float32 may add to a ratio, or put between two programs of the same arithmetic

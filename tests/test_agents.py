@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from algorithm_rows import KINDS
 
 from sqt_jax import networks
 from sqt_jax.agents import sac, td3, td7
@@ -21,15 +22,6 @@ VARIANTS = [name for name in ALGORITHMS if "_sqt" in name]
 PLAIN = [name for name in ALGORITHMS if "_sqt" not in name]
 
 
-def first_rows(kind):
-    """The first row of each kind: the others differ from it in numbers only, and share what is tested of it."""
-    found: dict = {}
-    for algo, row in ALGORITHMS.items():
-        found.setdefault(kind(row), algo)
-    return list(found.values())
-
-
-KINDS = first_rows(lambda row: (row.make_agent, row.settings.get("penalty")))
 BASES = [algo for algo in KINDS if algo in PLAIN]
 
 every_algorithm = pytest.mark.parametrize("algo", ALGORITHMS)

@@ -113,7 +113,7 @@ def test_the_swimmer_has_one_pipeline_and_takes_it_by_itself():
     ("name", "physics", "message"),
     [
         ("brax:ant", "mujoco", "physics takes one of mjx, generalized, spring, positional, not 'mujoco'"),
-        ("ant", "spring", "physics takes one of mjx, mujoco, not 'spring'"),
+        ("ant", "spring", "physics takes one of mjx, mujoco, warp, not 'spring'"),
         ("brax:antt", "mjx", "not 'brax:antt'; did you mean brax:ant?"),
     ],
 )

@@ -3,6 +3,7 @@
 import errno
 import os
 
+import algorithm_rows
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,11 +66,7 @@ def listing(store):
     return sorted(path.name for path in store.path.iterdir())
 
 
-@pytest.mark.parametrize(
-    # MaxMin and REDQ are TD3 and SAC of other sizes.
-    "algo",
-    [pytest.param(a, marks=[pytest.mark.slow] if a.startswith(("maxmin", "redq")) else []) for a in ALGORITHMS],
-)
+@algorithm_rows.every()
 def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)

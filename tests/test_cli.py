@@ -50,7 +50,7 @@ def test_a_run_leaves_its_files(finished):
     assert not any(name.endswith(".part") for name in names)
 
 
-@pytest.mark.parametrize("preset", ["paper", "released"])
+@pytest.mark.parametrize("preset", ["paper", pytest.param("released", marks=pytest.mark.slow)])
 def test_td7_tells_of_its_checkpoints(preset, tmp_path):
     """TD7's state and metrics are unlike the others': a whole run of it."""
     more = ("--algo=td7_sqt", "--embedding_size=8", f"--preset={preset}", "--policy_delay=2")
@@ -137,7 +137,7 @@ def test_output_of_a_run(tmp_path, capsys):
     assert run(tmp_path, "--penalty_coef=0,0.5", "--notensorboard") == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert "per member: 120 training steps; 4 evaluations of 2 episodes, up to 40 steps (25% of all)" in out
+    assert "per member: 120 training steps; 4 evaluations of 4 episodes, up to 80 steps (40% of all)" in out
     assert "step       120: return 5.0 +- 0.0 over 4 members" in out
     assert "mean +- std" in out
     path = tmp_path / "ant" / "sac_sqt" / "run"

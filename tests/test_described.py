@@ -72,15 +72,17 @@ def test_settings_of_a_run_have_what_is_swept_as_values():
 
 def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
     members, swept, content = written(tmp_path, "plain")
-    again = described.resumed(content, 100, 40, ["run", "--resume=x"])
-    again = described.resumed(again, 100, 60, ["run", "--resume=y"])
+    output = content["output"] | {"keep_checkpoints": 5}
+    again = described.resumed(content, 100, content["output"], 40, ["run", "--resume=x"])
+    again = described.resumed(again, 100, output, 60, ["run", "--resume=y"])
     assert again["settings"] == content["settings"] | {"steps": 100} and content["resumed"] == []
     assert [(entry["env_steps"], entry["command"][1]) for entry in again["resumed"]] == [
         (40, "--resume=x"),
         (60, "--resume=y"),
     ]
     assert all(entry["versions"] == described.versions() and entry["at"] for entry in again["resumed"])
-    for unchanged in content.keys() - {"settings", "resumed"}:
+    assert again["output"] == output
+    for unchanged in content.keys() - {"settings", "resumed", "output"}:
         assert again[unchanged] == content[unchanged]
     described.write(tmp_path, again)
     read = described.read(tmp_path)

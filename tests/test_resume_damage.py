@@ -158,7 +158,13 @@ def goes_on(finished, path, capsys, said):
     assert outside(path) == before
 
 
-@pytest.mark.parametrize("case", DAMAGED)
+# Whole runs: of each kind of damage one is in the fast suite.
+QUICK = ("manifest truncated", "rows elsewhere", "absurd size", "state flipped", "checkpoint a link", "rows missing")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[] if case in QUICK else pytest.mark.slow) for case in DAMAGED]
+)
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(finished, tmp_path, capsys, case):
     damage, reason = DAMAGED[case]
     path = copied(finished, tmp_path)
@@ -168,13 +174,33 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(finished, tmp_
     assert entry["env_steps"] == 40
 
 
-def test_where_no_checkpoint_is_whole_the_run_starts_anew(finished, tmp_path, capsys):
+def contents(path):
+    return {item: item.read_bytes() for item in path.rglob("*") if item.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("damage", "said", "reason"),
+    [
+        (lambda folder: flipped(min(folder.glob("rows_*"))), 2, "none of its 2 checkpoints is whole"),
+        (manifest(format=lambda _: 99), 0, "its checkpoints are of format '99', not "),
+        (of_another_step, 0, "its checkpoint at step 60 is of step 40"),
+    ],
+    ids=["no checkpoint is whole", "another format", "the state of another step"],
+)
+def test_a_run_that_cannot_be_gone_on_with_is_refused_and_left_as_it_is(
+    finished, tmp_path, capsys, damage, said, reason
+):
     path = copied(finished, tmp_path)
-    first = min((path / "checkpoint").glob("rows_*"))
-    flipped(first)
-    reason = f" cannot be used: {first.name} is damaged"
-    goes_on(finished, path, capsys, [f"^the checkpoint at step 60{reason}", f"^the checkpoint at step 40{reason}"])
-    assert json.loads((path / "config.json").read_text())["resumed"][-1]["env_steps"] == 0
+    damage(path / "checkpoint")
+    before = contents(tmp_path)
+    assert run(f"--resume={path}", "--steps=80", "--quiet") == 2
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) == said and err.count("\n") == 1
+    assert err.startswith(f"--resume={path}: takes a run with checkpoints to go on from; ") and reason in err
+    lock = path / "lock"
+    assert {item: text for item, text in contents(tmp_path).items() if item != lock} == {
+        item: text for item, text in before.items() if item != lock
+    }
 
 
 def test_nothing_is_written_through_what_lies_in_the_way(finished, tmp_path, capsys):

@@ -3,6 +3,7 @@
 import functools
 import re
 
+import algorithm_rows
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -181,7 +182,7 @@ def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
     np.testing.assert_allclose(rows[0][:, 3:], rows[1][:, 3:], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("algo", ["td3_sqt", "sac_sqt_tuple"])
+@pytest.mark.parametrize("algo", ["td3_sqt", pytest.param("sac_sqt_tuple", marks=pytest.mark.slow)])
 def test_a_seed_trains_alone_as_in_a_sweep(algo):
     config, _, sweep = make(algo)
     results = []
@@ -193,7 +194,7 @@ def test_a_seed_trains_alone_as_in_a_sweep(algo):
         np.testing.assert_allclose(alone[0], together[3], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("algo", PENALISED)
+@algorithm_rows.every(PENALISED)
 def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(algo):
     plain = algo.removesuffix("_tuple").removesuffix("_sqt")
     trained = {}
@@ -295,7 +296,7 @@ LEARN = {
 }
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@algorithm_rows.every()
 def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     """On `one_step` the best action is obs and Q is the reward, whatever the penalty: every step is terminal."""
     settings = LEARN | ({} if "temperature" in ALGORITHMS[algo].ignores else {"temperature": 0.01})
@@ -318,7 +319,7 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     assert (metrics["train_length"] == 1).all()
 
 
-@pytest.mark.parametrize("algo", ["td3", "sac"])
+@pytest.mark.parametrize("algo", ["td3", pytest.param("sac", marks=pytest.mark.slow)])
 def test_truncation_bootstraps_and_termination_does_not(algo):
     """Endless reward 1 is worth 1 / (1 - gamma) where only the time limit ends episodes; 3 steps of it 1 + g + g²."""
     values = {}
@@ -391,7 +392,7 @@ def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
         np.testing.assert_allclose(biases["value_bias_normalised"], biases["value_bias"] / 5, rtol=0.05)
 
 
-@pytest.mark.parametrize("algo", ["sac", "td7"])
+@pytest.mark.parametrize("algo", ["sac", pytest.param("td7", marks=pytest.mark.slow)])
 def test_critics_are_judged_by_the_policy_whose_values_they_estimate(algo):
     """SAC's critics by its samples, entropy included; TD7's by the checkpoint, which is what evaluation plays."""
     small = {"embedding_size": 16} if algo == "td7" else {}
