@@ -104,6 +104,7 @@ class Checkpoints:
             if found:
                 raise Refused(f"none of its {len(found)} checkpoints is whole")
             return None
+        whole = dict(list(whole.items())[: self.keep])
         latest, manifest = next(iter(whole.items()))
         state = self._read(latest, manifest, template)
         self._steps = {step: whole[step].position.evaluated for step in sorted(whole)}

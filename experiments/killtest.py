@@ -91,7 +91,8 @@ def result_of(path: Path) -> dict[str, Any]:
     for file in sorted((path / "checkpoint").glob("rows_*.bin")):
         start, stop = (int(word) for word in file.stem.split("_")[1:])
         rows.append(np.fromfile(file, np.float32).reshape(members, stop - start, -1))
-    result["rows"] = np.concatenate(rows, axis=1)
+    # Of earlier ones a file may be left.
+    result["rows"] = np.concatenate(rows, axis=1)[:, -described.read(path).content["replay_rows"] :]
     for name in ("evaluations", "metrics"):
         with (path / f"{name}.csv").open(newline="") as table:
             result[name] = [

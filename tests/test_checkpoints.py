@@ -199,6 +199,15 @@ def test_room_that_comes_back_is_used_by_the_same_process(case, tmp_path):
     assert identical(case.store(tmp_path).restore(case.template).state, case.trained(80))
 
 
+def test_a_resume_keeps_no_more_than_it_is_told_to(case, tmp_path):
+    case.saved(case.store(tmp_path, keep=3), 50, 60, 130)
+    store = case.store(tmp_path, keep=1)
+    store.restore(case.template)
+    store.remove_others()
+    assert [name for name in listing(store) if name.startswith("step")] == ["step_0000000130"]
+    assert identical(case.store(tmp_path).restore(case.template).state, case.trained(130))
+
+
 def test_where_nothing_was_saved_nothing_is_restored(case, tmp_path):
     assert case.store(tmp_path).restore(case.template) is None
 
