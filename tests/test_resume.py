@@ -60,7 +60,13 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
 
 @pytest.mark.parametrize(
     ("at", "by"),
-    [(0, signal.SIGINT), (20, signal.SIGTERM), (50, signal.SIGTERM), (80, signal.SIGINT), (100, signal.SIGTERM)],
+    [
+        (0, signal.SIGINT),
+        pytest.param(20, signal.SIGTERM, marks=pytest.mark.slow),
+        (50, signal.SIGTERM),
+        (80, signal.SIGINT),
+        pytest.param(100, signal.SIGTERM, marks=pytest.mark.slow),
+    ],
     ids=["at the first evaluation", "in the warm-up", "at an evaluation", "between two", "at both"],
 )
 def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, capsys, whole, at, by):
