@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sqt_jax.types import Array, Params
 
@@ -29,16 +30,21 @@ def uniform(bound: float):
 
 
 class Dense(nn.Module):
-    """A linear layer started as torch starts its own, U(±1/sqrt(fan_in)): what the papers' codes train from."""
+    """A linear layer started as torch starts its own, U(±1/sqrt(fan_in)): what the papers' codes train from.
+
+    Of several inputs side by side. Each is a product of its own, so that one which needs no gradient costs none.
+    """
 
     features: int
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
-        init = uniform(x.shape[-1] ** -0.5)
-        kernel = self.param("kernel", init, (x.shape[-1], self.features))
+    def __call__(self, *inputs: Array) -> Array:
+        widths = [x.shape[-1] for x in inputs]
+        init = uniform(sum(widths) ** -0.5)
+        kernel = self.param("kernel", init, (sum(widths), self.features))
         bias = self.param("bias", init, (self.features,))
-        return x @ kernel + bias
+        rows = jnp.split(kernel, np.cumsum(widths)[:-1])
+        return sum(x @ part for x, part in zip(inputs, rows, strict=True)) + bias
 
 
 def hidden_layers(x: Array, hidden: Sequence[int]) -> Array:

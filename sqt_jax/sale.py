@@ -38,8 +38,9 @@ class Encoder(nn.Module):
         return avg_l1_norm(self.state_layers[-1](x))
 
     def zsa(self, zs: Array, action: Array) -> Array:
-        x = jnp.concatenate([zs, action], axis=-1)
-        for layer in self.state_action_layers[:-1]:
+        first, *others = self.state_action_layers[:-1]
+        x = nn.elu(first(zs, action))
+        for layer in others:
             x = nn.elu(layer(x))
         return self.state_action_layers[-1](x)
 
@@ -58,8 +59,8 @@ class SaleActor(nn.Module):
     @nn.compact
     def __call__(self, obs: Array, zs: Array) -> Array | Gaussian:
         x = avg_l1_norm(Dense(self.hidden[0], name="layer0")(obs))
-        x = jnp.concatenate([x, zs], axis=-1)
-        for i, width in enumerate(self.hidden, start=1):
+        x = nn.relu(Dense(self.hidden[0], name="layer1")(x, zs))
+        for i, width in enumerate(self.hidden[1:], start=2):
             x = nn.relu(Dense(width, name=f"layer{i}")(x))
         mean = Dense(self.action_size, name=f"layer{len(self.hidden) + 1}")(x)
         if not self.gaussian:
@@ -75,8 +76,8 @@ class SaleCritic(nn.Module):
     @nn.compact
     def __call__(self, obs: Array, action: Array, zsa: Array, zs: Array) -> Array:
         x = avg_l1_norm(Dense(self.hidden[0], name="layer0")(jnp.concatenate([obs, action], axis=-1)))
-        x = jnp.concatenate([x, zsa, zs], axis=-1)
-        for i, width in enumerate(self.hidden, start=1):
+        x = nn.elu(Dense(self.hidden[0], name="layer1")(x, zsa, zs))
+        for i, width in enumerate(self.hidden[1:], start=2):
             x = nn.elu(Dense(width, name=f"layer{i}")(x))
         return Dense(1, name=f"layer{len(self.hidden) + 1}")(x)[..., 0]
 

@@ -40,6 +40,22 @@ def test_gaussian_actor_has_these_parameters():
     assert shapes(params) == {"params": expected}
 
 
+def test_a_layer_of_several_inputs_is_the_layer_of_their_concatenation():
+    layer = networks.Dense(7)
+    params = layer.init(KEY, OBS, ACTION)
+    joined = jnp.concatenate([OBS, ACTION], axis=-1)
+    assert shapes(params) == shapes(layer.init(KEY, joined))
+    np.testing.assert_allclose(layer.apply(params, OBS, ACTION), layer.apply(params, joined), rtol=1e-6)
+
+
+def test_an_input_that_needs_no_gradient_costs_none():
+    layer = networks.Dense(7)
+    params = layer.init(KEY, OBS, ACTION)
+    gradient = jax.make_jaxpr(jax.grad(lambda action: layer.apply(params, OBS, action).sum()))(ACTION)
+    products = [eqn for eqn in gradient.eqns if eqn.primitive.name == "dot_general"]
+    assert [eqn.outvars[0].aval.shape for eqn in products] == [(B, 7), (B, 7), (B, A)]  # two forwards, one back
+
+
 @pytest.mark.parametrize("n", [1, 2, N])
 def test_critics_have_a_leading_axis(n):
     params = jax.eval_shape(networks.critic_ensemble(n, HIDDEN).init, KEY, OBS, ACTION)

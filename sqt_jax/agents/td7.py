@@ -164,9 +164,8 @@ def make_sale_agent(
         encoder, encoder_opt = adam_step(state.encoder, state.encoder_opt, grads, state.scalars.lr, diverged)
         return state._replace(encoder=encoder, encoder_opt=encoder_opt, diverged=diverged), loss
 
-    def update_critic(state: TD7State, batch: Transition, noise: Noise) -> tuple[TD7State, Array, Metrics]:
+    def update_critic(state: TD7State, batch: Transition, zs: Array, noise: Noise) -> tuple[TD7State, Array, Metrics]:
         target, terms = td_target(state, batch, noise)
-        zs = encoder_net.zs(state.fixed_encoder, batch.obs)
         zsa = encoder_net.zsa(state.fixed_encoder, zs, batch.action)
         state, td_error, metrics = critics.update(
             lambda params: critic_net.apply(params, batch.obs, batch.action, zsa, zs),
@@ -181,9 +180,7 @@ def make_sale_agent(
         )
         return state._replace(value_bounds=bounds), td_error, metrics
 
-    def update_actor(state: TD7State, batch: Transition, noise: Noise) -> tuple[TD7State, Metrics]:
-        zs = encoder_net.zs(state.fixed_encoder, batch.obs)
-
+    def update_actor(state: TD7State, batch: Transition, zs: Array, noise: Noise) -> tuple[TD7State, Metrics]:
         def loss_fn(actor):
             action, log_prob = acting.own_action(actor_net.apply(actor, batch.obs, zs), noise)
             zsa = encoder_net.zsa(state.fixed_encoder, zs, action)
@@ -216,17 +213,18 @@ def make_sale_agent(
         encoder_metrics = {}
         if config.train_encoder:
             state, encoder_metrics["encoder_loss"] = update_encoder(state, batch)
-        state, td_error, metrics = update_critic(state, batch, noise)
+        zs = encoder_net.zs(state.fixed_encoder, batch.obs)
+        state, td_error, metrics = update_critic(state, batch, zs, noise)
         gradient_steps = state.gradient_steps + 1
 
-        def skip(state, batch, noise):
-            actor_metrics = jax.eval_shape(update_actor, state, batch, noise)[1]
+        def skip(state, *inputs):
+            actor_metrics = jax.eval_shape(update_actor, state, *inputs)[1]
             return state, dict.fromkeys(actor_metrics, jnp.full((), jnp.nan))  # not measured
 
         # Scalars that members share: real branches under vmap.
         actor_due = gradient_steps % config.policy_delay == 0
         copy_due = gradient_steps % config.target_update_period == 0
-        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, noise)
+        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, zs, noise)
         state = jax.lax.cond(copy_due, copy_targets, lambda state: state, state)
         if state.checkpoints:
             lowered = assessment.lower_best(config, state.checkpoints, gradient_steps)
