@@ -18,8 +18,14 @@ def first_rows(kind):
 KINDS = first_rows(lambda row: (row.make_agent, row.settings.get("penalty")))
 
 
-def every(names: Iterable[str] = ALGORITHMS):
-    """A test of each of these rows; those that differ from another one in sizes alone are slow tests."""
+ONE_OF_EACH = ("td3", "sac_sqt", "td7_sqt_tuple")  # each agent and each penalty
+
+
+def every(names: Iterable[str] = ALGORITHMS, fast: Iterable[str] = KINDS):
+    """A test of each of these rows; by itself, those that differ from another one in sizes alone are slow tests.
+
+    `fast` are those that are not slow.
+    """
     return pytest.mark.parametrize(
-        "algo", [pytest.param(a, marks=[] if a in KINDS else pytest.mark.slow) for a in names]
+        "algo", [pytest.param(a, marks=[] if a in fast else pytest.mark.slow) for a in names]
     )

@@ -9,9 +9,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # Before JAX is imported, and through the environment, so that processes started by tests share the cache.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-# Most of a test's time is compilation, and this halves it. `make test-all` sets XLA_FLAGS to nothing: programs as users
-# compile them.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+# Most of a test's time is compilation, and this halves it: no optimisation, and no parts of a program side by side, as
+# two test processes keep the cores busy. `make test-all` sets XLA_FLAGS to nothing: programs as users compile them.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402

@@ -65,6 +65,7 @@ def test_td7_tells_of_its_checkpoints(preset, tmp_path):
     assert float(last["best_min_return"]) == float(last["train_return"])
 
 
+@pytest.mark.slow
 def test_a_released_run_of_td3_has_sale_networks(tmp_path):
     assert run(tmp_path, "--algo=td3_sqt", "--embedding_size=8", "--preset=released") == 0
     config = json.loads((tmp_path / "ant" / "td3_sqt" / "run" / "config.json").read_text())

@@ -194,7 +194,7 @@ def test_a_seed_trains_alone_as_in_a_sweep(algo):
         np.testing.assert_allclose(alone[0], together[3], rtol=1e-4, atol=1e-6)
 
 
-@algorithm_rows.every(PENALISED)
+@algorithm_rows.every(PENALISED, fast=("td3_sqt", "td3_sqt_tuple", "sac_sqt"))
 def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(algo):
     plain = algo.removesuffix("_tuple").removesuffix("_sqt")
     trained = {}
@@ -296,7 +296,7 @@ LEARN = {
 }
 
 
-@algorithm_rows.every()
+@algorithm_rows.every(fast=algorithm_rows.ONE_OF_EACH)
 def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     """On `one_step` the best action is obs and Q is the reward, whatever the penalty: every step is terminal."""
     settings = LEARN | ({} if "temperature" in ALGORITHMS[algo].ignores else {"temperature": 0.01})
