@@ -39,7 +39,7 @@ def write_run(
         "settings": configs[0].flat(),
         "preset": "paper",
         "replay_rows": configs[0].train.capacity,
-        "evaluated_on": "mujoco",
+        "evaluated_on": configs[0].physics if env.startswith("brax:") else "mujoco",
         "swept": list(swept),
         "members": [
             {"member": index, "seed": seed, "penalty_coef": config.agent.penalty_coef}
