@@ -85,7 +85,7 @@ def _summary(content: Content) -> list[str | Element]:
         f"{trained:,}. How the runs ended: {_list(f'{n} {name}' for name, n in status.items())}."
     )
     if not _not_complete(content):
-        return [f"{text} Every cell is all that was planned."]
+        return [f"{text} Every score is of all that was planned."]
     link = element("a", "what that is", href=f"#{_id('Not complete')}")
     return [f"{text} ", element("strong", "Not everything is complete", class_="incomplete"), ": ", link, "."]
 
@@ -199,16 +199,15 @@ def _run(index: int, run: Details) -> Element:
 
 
 def _command(command: Command) -> list[Element]:
-    if command.text is None:
-        return [element("p", f"{command.label}: {command.note}.", class_="incomplete")]
-    made = [element("p", f"{command.label}:", class_="faint"), element("pre", element("code", command.text))]
+    made = [element("p", f"{command.label}:", class_="faint")]
+    made += [element("pre", element("code", command.text))] if command.text is not None else []
     return made + ([element("p", command.note, class_="incomplete")] if command.note else [])
 
 
 def _incomplete(content: Content) -> Element:
     lines = _not_complete(content)
     if not lines:
-        return element("p", "Nothing: every cell is all that was planned.")
+        return element("p", "Nothing: every score is of all that was planned.")
     return element("ul", *(element("li", line) for line in lines))
 
 

@@ -8,15 +8,10 @@ import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from experiments import command_line
-from experiments.command_line import Parser, file, guarded, one_of
+from experiments.command_line import Parser, file, guarded, one_of, printable
 from experiments.plots import STATISTICS
-
-if TYPE_CHECKING:
-    from experiments.collected import Collected
-    from experiments.run_details import Details
 
 EXAMPLE = "python -m experiments.report RUNS... --out=report.html"
 DESCRIPTION = """\
@@ -41,31 +36,22 @@ def parser() -> Parser:
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
     command_line.refuse_existing_file(options.out, options.overwrite)
-    from experiments import collected, described, figures, page, tabulated  # these take a second or two
+    from experiments import collected, described, figures, page, run_details, tabulated  # they take a second or two
 
     runs = collected.collect(options.runs)
     content = page.Content(
         runs,
         tabulated.make_tables(runs, options.reference, tabulated.task_sizes(runs)),
         {name: draw() for name, draw in figures.every(runs, options.statistic).items()},
-        _details(runs),
+        run_details.read_all(runs),
         datetime.now(UTC),
         f"sqt_jax {described.versions()['sqt_jax'] or 'of an unknown version'}",
         shlex.join(["python", "-m", "experiments.report", *argv[1:]]),
     )
     command_line.write_file(options.out, page.page(content).encode())
-    print(options.out)
-
-
-def _details(runs: "Collected") -> "list[Details]":
-    """Of each run, in the order of the tables."""
-    from experiments import run_details
-
-    curves: dict[Path, list] = {}
-    for group in runs.groups:
-        for member in group.members:
-            curves.setdefault(member.run, []).append(member)
-    return [run_details.read(path, members) for path, members in curves.items()]
+    print(printable(str(options.out)))
+    for note in runs.notes:
+        print(printable(note), file=sys.stderr)
 
 
 def main(argv: Sequence[str]) -> int:

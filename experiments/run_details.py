@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import described, files
-from experiments.collected import Curves, setting_text
+from experiments.collected import Collected, Curves, setting_text
 from experiments.command_line import UsageError
 from experiments.tabulated import NOTHING, number
 from sqt_jax.algorithms import make_config
@@ -56,6 +56,15 @@ class Details(NamedTuple):
     commands: list[Command]  # in the order in which they were given
     swept: list[str]
     members: list[Reached]
+
+
+def read_all(collected: Collected) -> list[Details]:
+    """Of all runs that something is known of, in the order of the tables. Raises as `read`."""
+    curves: dict[Path, list[Curves]] = {}
+    for group in collected.groups:
+        for member in group.members:
+            curves.setdefault(member.run, []).append(member)
+    return [read(path, members) for path, members in curves.items()]
 
 
 def read(path: Path, curves: Sequence[Curves]) -> Details:
@@ -136,19 +145,27 @@ def _changed(run: described.Described) -> list[Setting]:
 
 
 def _commands(content: Mapping[str, Any]) -> list[Command]:
-    found = [_command(content.get("command"), "It began with")]
+    found = [_command(content, "It began with")]
+    versions = content["versions"]
     for entry in content["resumed"]:
         entry = entry if isinstance(entry, dict) else {}
         at = entry.get("env_steps")
         where = f" at step {at:,}" if type(at) is int and at >= 0 else " from the start" if at == -1 else ""
-        found.append(_command(entry.get("command"), f"and was gone on with{where} by"))
+        command = _command(entry, f"and was gone on with{where} by")
+        own = entry.get("versions")
+        other = {n: v for n, v in own.items() if v != versions.get(n)} if isinstance(own, dict) else {}
+        if other:
+            changed = ", ".join(f"{name} {value}" for name, value in other.items())
+            command = command._replace(note=f"{command.note} From there on with other versions: {changed}.".strip())
+        found.append(command)
     return found
 
 
-def _command(words: Any, label: str) -> Command:
+def _command(entry: Mapping[str, Any], label: str) -> Command:
     """A command line as a shell takes it. Its first word was the path of `experiments/run.py`."""
+    words = entry.get("command")
     if not isinstance(words, list) or len(words) < 2 or not all(isinstance(word, str) for word in words):
-        return Command(None, label, "no command that could be repeated is recorded in config.json")
+        return Command(None, label, "No command that could be repeated is recorded in config.json.")
     note = ""
     if any(word.lstrip("-").partition("=")[0] == "config" for word in words[1:]):
         note = "It read flags from a file, which config.json does not hold; the settings that came of it are below."

@@ -1,9 +1,9 @@
 import base64
 import hashlib
 import re
-from html.parser import HTMLParser
 
 import pytest
+from html_reader import Reader
 from matplotlib.figure import Figure
 
 from experiments.figures import image
@@ -12,22 +12,6 @@ from experiments.markup import document, element, inline_svg
 pytestmark = pytest.mark.filterwarnings("ignore:Glyph 1 ")  # a control character in a figure
 
 HOSTILE = "<script>alert(1)</script> \"'& --> ]]>"
-
-
-class Reader(HTMLParser):
-    """Tags and texts of a page, as a browser takes them."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.attributes, self.texts = [], [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.attributes += attrs
-
-    def handle_data(self, data):
-        self.texts.append(data)
 
 
 def ids(svg):

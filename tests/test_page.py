@@ -1,8 +1,8 @@
 from datetime import UTC, datetime
 
 import pytest
+from html_reader import Reader
 from made_runs import write_run
-from test_markup import Reader
 
 from experiments import figures, run_details, tabulated
 from experiments.collected import collect
@@ -12,14 +12,11 @@ from experiments.tabulated import Cell
 
 def content_of(folder, reference=False):
     runs = collect([str(folder)])
-    curves = {}
-    for member in (member for group in runs.groups for member in group.members):
-        curves.setdefault(member.run, []).append(member)
     return Content(
         runs,
         tabulated.make_tables(runs, reference),
         {name: draw() for name, draw in figures.every(runs, "iqm").items()},
-        [run_details.read(path, members) for path, members in curves.items()],
+        run_details.read_all(runs),
         datetime(2026, 1, 2, 3, 4, tzinfo=UTC),
         "sqt_jax 1.2.3",
         "python -m experiments.report runs",
@@ -94,7 +91,7 @@ def test_footnotes_are_linked_and_no_id_is_there_twice(tmp_path):
 def test_a_complete_report_says_so(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 5, 10], [0, 6, 11]])
     text = page(content_of(tmp_path))
-    assert "Every cell is all that was planned." in text and "Not everything" not in text
+    assert "Every score is of all that was planned." in text and "Not everything" not in text
 
 
 def test_many_names_are_counted_in_the_title(tmp_path):

@@ -1,25 +1,12 @@
-import json
 import re
 import subprocess
 import sys
 
 import pytest
-from made_runs import write_run
-from test_markup import Reader
+from html_reader import Reader
+from made_runs import HOSTILE, make_hostile, write_run
 
 from experiments.report import main
-
-HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'`${1}\x1b\ud800"
-
-
-def make_hostile(path):
-    """Puts markup wherever a run's files may hold words of their own."""
-    content = json.loads((path / "config.json").read_text())
-    content |= {"preset": HOSTILE, "started": HOSTILE, "commit": HOSTILE, "command": ["run", f"--name={HOSTILE}"]}
-    content |= {"versions": {HOSTILE: HOSTILE, "jax": HOSTILE}, "device": {"platform": HOSTILE, "kind": HOSTILE}}
-    content["resumed"] = [{"env_steps": HOSTILE, "command": ["run", HOSTILE], "versions": {HOSTILE: HOSTILE}}]
-    (path / "config.json").write_text(json.dumps(content))
-    (path / "summary.json").write_text(json.dumps({"status": HOSTILE, "wall_seconds": HOSTILE}))
 
 
 @pytest.fixture
@@ -62,6 +49,12 @@ def test_it_is_replaced_only_where_asked(runs, tmp_path, capsys):
     assert out.read_text() == "mine"
     assert main(["report", str(runs), f"--out={out}", "--overwrite"]) == 0
     assert out.read_text().startswith("<!DOCTYPE html>")
+
+
+def test_what_was_left_out_is_said(runs, tmp_path, capsys):
+    (runs / "cheetah" / "td3" / "run" / "config.json").unlink()
+    assert main(["report", str(runs), f"--out={tmp_path / 'report.html'}"]) == 0
+    assert "td3/run has an evaluations.csv, but no config.json" in capsys.readouterr().err
 
 
 def test_what_a_run_says_is_never_markup(runs, tmp_path):

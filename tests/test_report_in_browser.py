@@ -2,8 +2,7 @@
 
 import browser
 import pytest
-from made_runs import write_run
-from test_report import make_hostile
+from made_runs import make_hostile, write_run
 
 from experiments.report import main
 

@@ -71,21 +71,23 @@ def test_what_is_swept_and_what_diverged(tmp_path):
 
 def test_a_run_that_was_gone_on_with_has_all_its_commands(tmp_path):
     resumed = [
-        {"env_steps": 1000, "command": ["run.py", "--resume=x"]},
+        {"env_steps": 1000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.10.2"}},
+        {"env_steps": 2000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.11", "brax": "1"}},
         {"env_steps": -1, "command": ["run.py", "--config=f.yaml"]},
         "nonsense",
     ]
-    first, second, third, fourth = details(write_run(tmp_path), resumed=resumed).commands
+    first, second, other, third, fourth = details(write_run(tmp_path), resumed=resumed).commands
     assert first.text is None  # made runs have none
     assert second == ("python -m experiments.run --resume=x", "and was gone on with at step 1,000 by", "")
+    assert other.note == "From there on with other versions: jax 0.11, brax 1."
     assert third.label == "and was gone on with from the start by" and "read flags from a file" in third.note
-    assert fourth.text is None and "no command" in fourth.note
+    assert fourth.text is None and "No command" in fourth.note
 
 
 @pytest.mark.parametrize("command", [None, [], ["run"], "run --algo=td3", ["run", 3], {"a": 1}])
 def test_what_is_not_recorded_is_said(tmp_path, command):
     found = details(write_run(tmp_path), command=command, device=3)
-    assert found.commands[0].text is None and "no command that could be repeated" in found.commands[0].note
+    assert found.commands[0].text is None and "No command that could be repeated" in found.commands[0].note
     assert {found.facts[name] for name in ("began", "device", "commit")} == {"not recorded in config.json"}
 
 
