@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import statistics
-from experiments.command_line import UsageError
+from experiments.command_line import UsageError, printable
 
 REQUIRED = ("member", "env_steps", "gradient_steps", "seed", "return_mean", "q_std")
 # In these alone do an algorithm with SQT and its base differ, where they can be compared.
@@ -33,7 +33,7 @@ class Curves(NamedTuple):
     run: Path
     seed: int
     settings: dict[str, Any]
-    versions: dict[str, Any]
+    versions: dict[str, str]
     columns: dict[str, np.ndarray]  # of evaluations.csv, in the order of the env steps
 
 
@@ -267,7 +267,8 @@ def _below(path: Path) -> tuple[list[Path], list[Path]]:
 
 def read_run(path: Path) -> list[Curves]:
     """The members of a run that have an evaluation. Raises `UsageError` where its files cannot be understood."""
-    from experiments import described  # brings JAX
+    from experiments import described  # these bring JAX
+    from sqt_jax import envs
 
     try:
         run = described.read(path)
@@ -279,6 +280,9 @@ def read_run(path: Path) -> list[Curves]:
     except ValueError as error:
         raise UsageError(f"{path}: its evaluations.csv is damaged: {error}") from None
     evaluated_on = run.content.get("evaluated_on")
+    if evaluated_on is not None and evaluated_on not in envs.simulators(run.members[0].config.env):
+        raise UsageError(f"{path}: its config.json names a physics that cannot be (evaluated_on)")
+    versions = {printable(name): printable(str(value)) for name, value in run.content["versions"].items()}
     found = []
     for index, member in enumerate(run.members):
         kept = columns["member"] == index
@@ -292,9 +296,9 @@ def read_run(path: Path) -> list[Curves]:
         settings, rows = member.config.flat(), run.content["replay_rows"]
         # A larger one trains the same; a run that was gone on with has that of its first steps.
         settings["replay_capacity"] = rows if rows < settings["steps"] else "all"
-        if isinstance(evaluated_on, str):
+        if evaluated_on is not None:
             settings["eval_physics"] = evaluated_on
-        found.append(Curves(path, member.seed, settings, run.content["versions"], own))
+        found.append(Curves(path, member.seed, settings, versions, own))
     if not set(columns["member"]) <= set(range(len(run.members))):
         raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that its config.json has not")
     return found
@@ -307,6 +311,9 @@ def _read_table(path: Path) -> dict[str, np.ndarray]:
     if not lines:
         raise ValueError("it is empty")
     names, rows = lines[0], lines[1:]
+    for name in names:  # they become names of files, and text in figures
+        if not (name.isascii() and name.isidentifier()):
+            raise ValueError(f"{name[:40]!r} is no name of a column")
     for name in REQUIRED:
         if name not in names:
             raise ValueError(f"it has no column {name}")

@@ -82,6 +82,13 @@ def folder(text: str) -> Path:
     return Path(text)
 
 
+def file(text: str) -> Path:
+    """The type of a flag that takes a file, which need not be there."""
+    if not Path(text).name or text.endswith("/") or "\0" in text:
+        raise argparse.ArgumentTypeError("takes a file")
+    return Path(text)
+
+
 def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
     """Raises `UsageError` where files would be replaced that may not be, or `out` is no folder."""
     if out.exists() and not out.is_dir():
@@ -92,6 +99,34 @@ def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
     for name in there:
         if (out / name).is_dir():
             raise UsageError(f"--out={out}: {name} is a folder; takes a folder without it")
+
+
+def refuse_existing_file(out: Path, overwrite: bool) -> None:
+    """Raises `UsageError` where `out` is there and may not be replaced, or can be no file."""
+    try:
+        if out.is_dir() and not out.is_symlink():
+            raise UsageError(f"--out={out}: takes a file, which this is not")
+        there = out.exists() or out.is_symlink()
+    except OSError as error:
+        raise _unwritable(out, error) from None
+    if there and not overwrite:
+        raise UsageError(f"--out={out}: is there already; takes another file, or --overwrite replaces it")
+    if out.parent.exists() and not out.parent.is_dir():
+        raise UsageError(f"--out={out}: takes a file in a folder, and {out.parent} is none")
+
+
+def write_file(out: Path, content: bytes) -> None:
+    """Writes a whole file, and the folders it lies in. Raises `UsageError` where that cannot be."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with files.whole_file(out) as stream:
+            stream.write(content)
+    except OSError as error:
+        raise _unwritable(out, error) from None
+
+
+def _unwritable(out: Path, error: OSError) -> UsageError:
+    return UsageError(f"--out={out}: takes a file that can be written: {error.strerror}")
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
@@ -105,12 +140,17 @@ def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
         raise UsageError(f"--out={out}: takes a folder that can be written: {error.strerror}") from None
 
 
+def printable(text: str, kept: str = "") -> str:
+    """With escapes for what is not to be seen, such as control characters and halves of surrogates, but for `kept`."""
+    return "".join(c if c.isprintable() or c in kept else repr(c)[1:-1] for c in text)
+
+
 def guarded(command: Callable[[Sequence[str]], Any], argv: Sequence[str]) -> int:
     """Runs a command; the exit code. A `UsageError` is one line on stderr."""
     try:
         command(argv)
     except UsageError as error:
-        print("".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error)), file=sys.stderr)
+        print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
     except SystemExit as left:  # after --help
         return left.code if isinstance(left.code, int) else BAD_USAGE

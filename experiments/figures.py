@@ -2,10 +2,12 @@
 
 import io
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -112,6 +114,19 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
     left.legend(frameon=False, fontsize="small", loc="best")
     figure.suptitle(f"{title}: mean and std over seeds, thin lines the seeds", fontsize="medium")
     figure.savefig(path)
+
+
+def every(collected: Collected, statistic: str) -> dict[str, Callable[[], Figure | None]]:
+    """All figures by name, each as what draws it; that gives None where there is nothing to show."""
+    biases = [column for group in collected.groups for column in group.columns("value_bias")]
+    columns = dict.fromkeys(["return_mean", "q_std", *biases])
+    draw: dict[str, Callable[[], Figure | None]] = {
+        {"return_mean": "learning_curves"}.get(column, column): partial(over_time, collected, column, statistic)
+        for column in columns
+    }
+    draw |= {"penalty_sweep": partial(penalty_sweep, collected, statistic)}
+    draw |= {"performance_profile": partial(performance_profile, collected)}
+    return {name: partial(_without_formulas, function) for name, function in draw.items()}
 
 
 def over_time(collected: Collected, column: str, statistic: str) -> Figure | None:
@@ -245,11 +260,18 @@ def performance_profile(collected: Collected) -> Figure | None:
 
 
 def image(figure: Figure, kind: str) -> bytes:
-    """The figure as `png`, `svg` or `pdf`; the same figure gives the same bytes of a PNG."""
+    """The figure as `png`, `svg` or `pdf`; a figure drawn anew gives the same PNG and SVG."""
     stream = io.BytesIO()
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind, {})
-    figure.savefig(stream, format=kind, metadata=metadata)
+    with matplotlib.rc_context({"svg.hashsalt": "sqt_jax"}):  # else its ids are random
+        figure.savefig(stream, format=kind, metadata=metadata)
     return stream.getvalue()
+
+
+def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
+    """A dollar in a version's name is a dollar: what a run's files say is not typeset."""
+    with matplotlib.rc_context({"text.parse_math": False}):
+        return draw()
 
 
 class _Stars:

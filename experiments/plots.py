@@ -5,7 +5,6 @@ Exit codes: 0 done; 2 bad usage (one line, nothing written).
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from experiments import command_line
@@ -38,16 +37,7 @@ def command(argv: Sequence[str]) -> None:
     from experiments import collected, figures  # these and what they bring take a second or two
 
     runs = collected.collect(options.runs)
-    biases = [column for group in runs.groups for column in group.columns("value_bias")]
-    columns = dict.fromkeys(["return_mean", "q_std", *biases])
-    draw = {
-        {"return_mean": "learning_curves"}.get(column, column): partial(
-            figures.over_time, runs, column, options.statistic
-        )
-        for column in columns
-    }
-    draw |= {"penalty_sweep": partial(figures.penalty_sweep, runs, options.statistic)}
-    draw |= {"performance_profile": partial(figures.performance_profile, runs)}
+    draw = figures.every(runs, options.statistic)
     command_line.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
     drawn = {name: function() for name, function in draw.items()}
     contents = {

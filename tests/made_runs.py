@@ -9,6 +9,8 @@ import numpy as np
 from experiments.records import EVALUATION_COLUMNS
 from sqt_jax.algorithms import make_config
 
+# Markup, and what no terminal should see.
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'`${1}\x1b\ud800"
 STEPS = 100  # of a made run, evaluated at 0, 50 and 100, with updates after 10
 
 
@@ -39,7 +41,7 @@ def write_run(
         "settings": configs[0].flat(),
         "preset": "paper",
         "replay_rows": configs[0].train.capacity,
-        "evaluated_on": "mujoco",
+        "evaluated_on": configs[0].physics if env.startswith("brax:") else "mujoco",
         "swept": list(swept),
         "members": [
             {"member": index, "seed": seed, "penalty_coef": config.agent.penalty_coef}
@@ -66,3 +68,13 @@ def write_run(
                 row |= {name: values[index][evaluation] for name, values in (more or {}).items()}
                 writer.writerow({name: "" if value != value else value for name, value in row.items()})
     return path
+
+
+def make_hostile(path):
+    """Puts markup wherever a run's files may hold words of their own."""
+    content = json.loads((path / "config.json").read_text())
+    content |= {"preset": HOSTILE, "started": HOSTILE, "commit": HOSTILE, "command": ["run", f"--name={HOSTILE}"]}
+    content |= {"versions": {HOSTILE: HOSTILE, "jax": HOSTILE}, "device": {"platform": HOSTILE, "kind": HOSTILE}}
+    content["resumed"] = [{"env_steps": HOSTILE, "command": ["run", HOSTILE], "versions": {HOSTILE: HOSTILE}}]
+    (path / "config.json").write_text(json.dumps(content))
+    (path / "summary.json").write_text(json.dumps({"status": HOSTILE, "wall_seconds": HOSTILE}))

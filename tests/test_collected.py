@@ -147,6 +147,7 @@ def test_a_run_without_an_evaluation_is_left_out_and_named(tmp_path):
     [
         (lambda text: "", "it is empty"),
         (lambda text: text.replace("q_std", "std"), "it has no column q_std"),
+        (lambda text: text.replace("value_bias", "value_bias/../x"), "'value_bias/../x' is no name of a column"),
         (lambda text: text.replace("2.0", "two"), "could not convert string to float: 'two'"),
         (lambda text: text.replace(",0.5,", ","), "line 3 has 11 fields instead of 12"),
         (lambda text: text + text.splitlines()[-1] + "\n", "member 0 has other rows than it should"),
@@ -164,6 +165,20 @@ def test_damaged_evaluations_are_named(tmp_path, damage, message):
     with pytest.raises(UsageError) as error:
         collect([str(path)])
     assert str(error.value) == f"{path}: its evaluations.csv is damaged: {message}"
+
+
+@pytest.mark.parametrize("value", ["<script>", "warp drive", 3, ["mjx"], ""])
+def test_a_physics_that_cannot_have_evaluated_is_refused(tmp_path, value):
+    path = write_run(tmp_path)
+    content = json.loads((path / "config.json").read_text()) | {"evaluated_on": value}
+    (path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(UsageError, match=r"its config.json names a physics that cannot be \(evaluated_on\)"):
+        collect([str(path)])
+
+
+def test_versions_are_text_that_can_be_shown(tmp_path):
+    write_run(tmp_path, versions={"jax": "\ud800\n$x", "brax\x1b": None})
+    assert only(collect([str(tmp_path)])).members[0].versions == {"jax": "\\ud800\\n$x", "brax\\x1b": "None"}
 
 
 def test_runs_that_cannot_be_read_are_named(tmp_path):

@@ -1,3 +1,5 @@
+import argparse
+
 import pytest
 
 from experiments import command_line
@@ -82,3 +84,28 @@ def test_a_link_is_replaced_and_not_written_through(tmp_path):
         command_line.refuse_existing(tmp_path, ["a.csv"], overwrite=False)
     command_line.write_files(tmp_path, {"a.csv": b"1"})
     assert (tmp_path / "precious").read_text() == "x" and not (tmp_path / "a.csv").is_symlink()
+
+
+def test_one_file_is_refused_where_it_may_not_be_and_written_whole(tmp_path):
+    out = tmp_path / "new" / "report.html"
+    command_line.refuse_existing_file(out, overwrite=False)
+    command_line.write_file(out, b"1")
+    with pytest.raises(UsageError, match=r"report.html: is there already; takes another file, or --overwrite"):
+        command_line.refuse_existing_file(out, overwrite=False)
+    command_line.refuse_existing_file(out, overwrite=True)
+    command_line.write_file(out, b"2")
+    assert out.read_bytes() == b"2" and [*out.parent.iterdir()] == [out]
+    for path in (tmp_path, out / "below.html", tmp_path / ("x" * 300)):
+        with pytest.raises(UsageError, match="--out=.*: takes a file"):
+            command_line.refuse_existing_file(path, overwrite=True)
+            command_line.write_file(path, b"")
+
+
+@pytest.mark.parametrize("text", ["", ".", "/", "folder/", "a\0b"])
+def test_what_can_be_no_file(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="takes a file"):
+        command_line.file(text)
+
+
+def test_what_is_not_to_be_seen_is_escaped():
+    assert command_line.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"

@@ -204,3 +204,15 @@ def test_images(tmp_path, kind, start):
     write_run(tmp_path)
     figure = over_time(collect([str(tmp_path)]), "q_std", "iqm")
     assert figures.image(figure, kind).startswith(start)
+
+
+def test_every_figure_is_drawn_and_takes_no_text_for_a_formula(tmp_path):
+    write_run(tmp_path / "a", "td3", curves=[[0, 1, 2]], seeds=[0])
+    write_run(tmp_path / "b", "td3", curves=[[0, 1, 3]], seeds=[1], versions={"jax": r"$\frac{"})
+    draw = figures.every(collect([str(tmp_path)]), "iqm")
+    drawn = {name: function() for name, function in draw.items()}
+    assert {name for name, figure in drawn.items() if figure} == {"learning_curves", "q_std", "performance_profile"}
+    assert drawn["penalty_sweep"] is None and drawn["value_bias"] is None
+    curves = drawn["learning_curves"]
+    assert r"jax 0.10.2, $\frac{" in " ".join(text.get_text() for text in curves.texts if text.get_text())
+    assert figures.image(curves, "svg") == figures.image(draw["learning_curves"](), "svg")

@@ -1,0 +1,19 @@
+"""What is on a page, read as a browser reads it, without one."""
+
+from html.parser import HTMLParser
+
+
+class Reader(HTMLParser):
+    """Tags and texts of a page, as a browser takes them."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.attributes, self.texts = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+
+    def handle_data(self, data):
+        self.texts.append(data)

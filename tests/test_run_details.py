@@ -1,0 +1,116 @@
+import json
+
+import pytest
+from made_runs import write_run
+
+from experiments import run_details
+from experiments.collected import collect
+from experiments.command_line import UsageError
+
+NAN = float("nan")
+
+
+def details(path, **content):
+    """Of a run whose config.json also has `content`; None is taken out."""
+    file = path / "config.json"
+    changed = json.loads(file.read_text()) | content
+    file.write_text(json.dumps({name: value for name, value in changed.items() if value is not None}))
+    members = [member for group in collect([str(path)]).groups for member in group.members]
+    return run_details.read(path, members)
+
+
+def test_what_config_json_says(tmp_path):
+    found = details(
+        write_run(
+            tmp_path, "td3_sqt", curves=[[0, 1, 2], [0, 3, 2]], seeds=[4, 7], versions={"jax": "1", "brax": None}
+        ),
+        started="2026-01-02T03:04:05+00:00",
+        device={"platform": "cpu", "kind": "cpu", "cpus": 2},
+        commit="abc+changes",
+        command=["/somewhere/run.py", "--algo=td3_sqt", "--name=a b;$(c)"],
+    )
+    assert (found.algo, found.env, found.seeds, found.steps, found.physics) == (
+        "td3_sqt",
+        "cheetah",
+        (4, 7),
+        100,
+        "mjx",
+    )
+    assert found.versions == {"jax": "1", "brax": "not installed"}
+    assert found.facts == {
+        "began": "2026-01-02T03:04:05+00:00",
+        "evaluated on": "mujoco",
+        "preset": "paper",
+        "device": "cpu, 2 CPUs",
+        "commit": "abc, with changes that are in no commit",
+    }
+    (command,) = found.commands
+    assert command.text == "python -m experiments.run --algo=td3_sqt '--name=a b;$(c)'"
+    assert [(s.name, s.value, s.default) for s in found.settings] == [
+        ("steps", "100", "1,000,000"),
+        ("warmup_steps", "10", "25,000"),
+        ("batch_size", "8", "256"),
+        ("eval_every", "50", "5,000"),
+        ("eval_episodes", "1", "10"),
+    ]
+    assert [(m.seed, m.env_steps, m.final, m.best, m.best_env_steps) for m in found.members] == [
+        (4, "100", "2.00", "2.00", "100"),
+        (7, "100", "2.00", "3.00", "50"),
+    ]
+
+
+def test_what_is_swept_and_what_diverged(tmp_path):
+    swept = {"penalty_coef": (0.1, 0.5)}
+    found = details(write_run(tmp_path, "td3_sqt", curves=[[0, 1, NAN], [NAN, NAN, NAN]], swept=swept))
+    assert found.settings[0] == ("penalty_coef", "0.1, 0.5", "0.5")
+    assert [(m.swept, m.final, m.best) for m in found.members] == [
+        (("0.1",), "- (diverged)", "1.00"),
+        (("0.5",), "- (diverged)", "-"),
+    ]
+
+
+def test_a_run_that_was_gone_on_with_has_all_its_commands(tmp_path):
+    resumed = [
+        {"env_steps": 1000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.10.2"}},
+        {"env_steps": 2000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.11", "brax": "1"}},
+        {"env_steps": -1, "command": ["run.py", "--config=f.yaml"]},
+        "nonsense",
+    ]
+    first, second, other, third, fourth = details(write_run(tmp_path), resumed=resumed).commands
+    assert first.text is None  # made runs have none
+    assert second == ("python -m experiments.run --resume=x", "and was gone on with at step 1,000 by", "")
+    assert other.note == "From there on with other versions: jax 0.11, brax 1."
+    assert third.label == "and was gone on with from the start by" and "read flags from a file" in third.note
+    assert fourth.text is None and "No command" in fourth.note
+
+
+@pytest.mark.parametrize("command", [None, [], ["run"], "run --algo=td3", ["run", 3], {"a": 1}])
+def test_what_is_not_recorded_is_said(tmp_path, command):
+    found = details(write_run(tmp_path), command=command, device=3)
+    assert found.commands[0].text is None and "No command that could be repeated" in found.commands[0].note
+    assert {found.facts[name] for name in ("began", "device", "commit")} == {"not recorded in config.json"}
+
+
+@pytest.mark.parametrize(
+    ("summary", "status", "took"),
+    [
+        (None, "not ended: no summary.json", None),
+        ('{"status": "done", "wall_seconds": 12.345, "steps_per_second": null}', "done", "12.3 s"),
+        ('{"status": "interrupted", "wall_seconds": "<b>"}', "interrupted", None),
+        ('{"status": "<script>"}', "not known: summary.json cannot be understood", None),
+        ('{"status": ["done"]}', "not known: summary.json cannot be understood", None),
+        ("[1]", "not known: summary.json cannot be understood", None),
+        ("{", "not known: summary.json cannot be understood", None),
+    ],
+)
+def test_how_it_ended(tmp_path, summary, status, took):
+    path = write_run(tmp_path)
+    if summary is not None:
+        (path / "summary.json").write_text(summary)
+    found = details(path)
+    assert (found.status, found.facts.get("took")) == (status, took)
+
+
+def test_no_run_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"it has no config.json that can be read"):
+        run_details.read(tmp_path, [])
