@@ -11,6 +11,7 @@ import numpy as np
 
 TRACKING = "track"  # the camera that follows the robot, in the models of Gymnasium's locomotion tasks
 
+DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees, of a camera of our own: from where Gymnasium's look
 SHADOW_TEXELS = 1024  # as fine as the pictures are; MuJoCo's 4096 double the time that software takes to draw one
 
 
@@ -60,7 +61,8 @@ def view_of(model: mujoco.MjModel, camera: str = "") -> mujoco.MjvCamera:
 
 def following(model: mujoco.MjModel, view: mujoco.MjvCamera) -> mujoco.MjvCamera:
     """Makes `view` one that follows the robot and can be turned by hand."""
-    mujoco.mjv_defaultFreeCamera(model, view)
+    mujoco.mjv_defaultFreeCamera(model, view)  # from as far as the whole floor is wide
     view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
     view.trackbodyid = min(1, model.nbody - 1)
+    view.distance, view.elevation = DISTANCE, ELEVATION
     return view

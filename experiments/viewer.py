@@ -32,9 +32,9 @@ def show(
       ValueError: the model has no such camera.
     """
     if launch is None:
-        import mujoco.viewer
+        from mujoco import viewer  # it brings GLFW
 
-        launch = mujoco.viewer.launch_passive
+        launch = viewer.launch_passive
     view = rendering.view_of(model, camera) if camera else rendering.following(model, mujoco.MjvCamera())
     data = mujoco.MjData(model)
     with launch(model, data, show_left_ui=False, show_right_ui=False) as window:

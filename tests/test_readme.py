@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import flags, plots, run, tables
+from experiments import flags, play, plots, run, tables
 from experiments.plan import make_plan
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
@@ -25,7 +25,7 @@ LOOKS = [
     for language, _, code in BLOCKS
     if language == "sh"
     for line in code.splitlines()
-    if re.search(r" -m experiments\.(tables|plots) ", line)
+    if re.search(r" -m experiments\.(tables|plots|play) ", line)
 ]
 
 
@@ -45,11 +45,12 @@ def test_commands_are_understood(argv, tmp_path):
 
 @pytest.mark.parametrize("argv", LOOKS, ids=lambda argv: " ".join(argv))
 def test_commands_that_look_at_runs_are_understood(argv):
-    assert {"experiments.tables": tables, "experiments.plots": plots}[argv[0]].parser().read(argv).runs
+    commands = {"experiments.tables": tables, "experiments.plots": plots, "experiments.play": play}
+    assert commands[argv[0]].parser().read(argv).runs
 
 
 def test_the_readme_has_them():
-    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4 and len(LOOKS) >= 4
+    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4 and len(LOOKS) >= 6
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
