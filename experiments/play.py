@@ -185,6 +185,8 @@ def _play(task: Task, policy: Callable, options: argparse.Namespace, console: "C
 
     key = jax.random.key(options.start_seed)
     most = min(options.steps or task.env.episode_length, task.env.episode_length)
+    if task.physics != "mujoco":  # which compiles in a second or two
+        console.print(f"compiling the episodes for {task.physics}", highlight=False)
     with progress.counting("playing, steps", most, console) as watch:
         return episodes.play(task.env, policy, task.look, key, options.episodes, options.steps, watch)
 

@@ -1,5 +1,7 @@
 """MuJoCo's viewer shows the states in order, in real time, until its window is closed. The window is made up."""
 
+import threading
+import time
 from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 
@@ -19,12 +21,21 @@ class Window:
 
     def __init__(self, pictures):
         self.left, self.shown, self.closed = pictures, [], False
-        self.cam = mujoco.MjvCamera()
+        self.cam, self.told = mujoco.MjvCamera(), threading.Event()
 
     @contextmanager
     def launch(self, model, data, show_left_ui, show_right_ui):
-        self.data = data
-        yield self
+        self.m, self.d = model, data
+        thread = threading.Thread(target=self._draw)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self.told.set()
+
+    def _draw(self):
+        self.told.wait(10)
+        time.sleep(0.1)  # it closes in its own time
         self.closed = True
 
     def is_running(self):
@@ -32,7 +43,7 @@ class Window:
 
     def sync(self):
         self.left -= 1
-        self.shown.append((self.data.qpos[0], self.data.qvel[0], self.data.xpos[1, 0]))
+        self.shown.append((self.d.qpos[0], self.d.qvel[0], self.d.xpos[1, 0]))
 
     def lock(self):
         return nullcontext()
@@ -70,3 +81,14 @@ def test_a_camera_can_be_named():
     assert (window.cam.type, window.cam.fixedcamid) == (mujoco.mjtCamera.mjCAMERA_FIXED, MODEL.camera("track").id)
     with pytest.raises(ValueError, match="takes one of track"):
         viewer.show(MODEL, [states([1])], 0.008, "side", launch=window.launch)
+
+
+def test_the_window_is_closed_before_an_interrupt_goes_on():
+    window = Window(pictures=5)
+
+    def interrupted(seconds):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        viewer.show(MODEL, [states([1])], 0.008, launch=window.launch, sleep=interrupted)
+    assert window.closed
