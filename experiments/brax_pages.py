@@ -36,4 +36,5 @@ def page(env: Any, shown: Sequence[Any]) -> bytes:
     ]
     # The viewer takes one state for each of the simulator's steps, of which a control step has several.
     system = env.sys.tree_replace({"opt.timestep": float(env.dt)})
-    return html.render(system, states, colab=False).encode()
+    # the whole window: a height that is a number has no unit there, and counts for nothing
+    return html.render(system, states, height="100vh", colab=False).encode()

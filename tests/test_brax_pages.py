@@ -22,7 +22,7 @@ NAME = "brax:inverted_pendulum"  # the smallest: it compiles in seconds
 def states_in(page):
     """The system and the positions of its links [states, L, 3] in a page."""
     text = page.decode()
-    assert "<html" in text and "viewer.js" in text
+    assert "<html" in text and "viewer.js" in text and "height: 100vh;" in text
     (data,) = re.findall(r'"([A-Za-z0-9+/=]{1000,})"', text)
     system = json.loads(zlib.decompress(base64.b64decode(data)))
     return system, np.array([state["pos"] for state in system["states"]["x"]])
