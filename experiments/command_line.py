@@ -1,10 +1,11 @@
-"""Command lines that look at finished runs: `RUNS...` and a few flags, refused in one line.
+"""Command lines that look at finished runs: `RUNS...` or one `RUN`, and a few flags, refused in one line.
 
 Nothing here brings JAX, so that a typing error is answered at once.
 """
 
 import argparse
 import difflib
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,18 +21,23 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with this repository's messages: one line, `--flag: takes ...`."""
+    """argparse with this repository's messages: one line, `--flag: takes ...`.
 
-    def __init__(self, description: str, example: str):
+    Args:
+      one: whether it takes the folder of one run, `RUN`, and not any number of `RUNS`.
+    """
+
+    def __init__(self, description: str, example: str, one: bool = False):
         super().__init__(
-            prog=example.partition(" RUNS")[0],
+            prog=example.partition(" RUN")[0],
             description=description,
-            epilog="RUNS are run folders, or folders above them.",
+            epilog=None if one else "RUNS are run folders, or folders above them.",
             allow_abbrev=False,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        self.example = example
-        self.add_argument("runs", nargs="*", metavar="RUNS", help="folders of runs, or folders above them")
+        self.example, self.one = example, one
+        name, text = ("RUN", "the folder of a run") if one else ("RUNS", "folders of runs, or folders above them")
+        self.add_argument("runs", nargs="*", metavar=name, help=text)
 
     def read(self, argv: Sequence[str]) -> argparse.Namespace:
         """The values of `argv`, program name first; leaves with 0 where it asks for help. Raises `UsageError`."""
@@ -43,6 +49,8 @@ class Parser(argparse.ArgumentParser):
             raise UsageError(
                 f"{name}: unknown flag{f'; did you mean {near[0]}?' if near else '; --help lists the flags'}"
             )
+        if self.one and len(options.runs) != 1:
+            raise UsageError(f"RUN: takes the folder of one run, as in {self.example}")
         if not options.runs:
             raise UsageError(f"RUNS: takes folders of runs or folders above them, as in {self.example}")
         return options
@@ -75,6 +83,18 @@ def whole(text: str) -> int:
     return int(text)
 
 
+def between(low: int, high: int) -> Callable[[str], int]:
+    """The type of a flag that takes a whole number from `low` to `high`."""
+
+    def parse(text: str) -> int:
+        # Python refuses to read far more digits than any limit has
+        if not (text.isascii() and text.isdecimal() and len(text) < 20 and low <= int(text) <= high):
+            raise argparse.ArgumentTypeError(f"takes a whole number from {low} to {high}, not {text[:50]!r}")
+        return int(text)
+
+    return parse
+
+
 def folder(text: str) -> Path:
     """The type of a flag that takes a folder, which need not be there."""
     if not text or "\0" in text:
@@ -101,20 +121,6 @@ def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
             raise UsageError(f"--out={out}: {name} is a folder; takes a folder without it")
 
 
-def refuse_existing_file(out: Path, overwrite: bool) -> None:
-    """Raises `UsageError` where `out` is there and may not be replaced, or can be no file."""
-    try:
-        if out.is_dir() and not out.is_symlink():
-            raise UsageError(f"--out={out}: takes a file, which this is not")
-        there = out.exists() or out.is_symlink()
-    except OSError as error:
-        raise _unwritable(out, error) from None
-    if there and not overwrite:
-        raise UsageError(f"--out={out}: is there already; takes another file, or --overwrite replaces it")
-    if out.parent.exists() and not out.parent.is_dir():
-        raise UsageError(f"--out={out}: takes a file in a folder, and {out.parent} is none")
-
-
 def write_file(out: Path, content: bytes) -> None:
     """Writes a whole file, and the folders it lies in. Raises `UsageError` where that cannot be."""
     try:
@@ -127,6 +133,20 @@ def write_file(out: Path, content: bytes) -> None:
 
 def _unwritable(out: Path, error: OSError) -> UsageError:
     return UsageError(f"--out={out}: takes a file that can be written: {error.strerror}")
+
+
+def refuse_file(flag: str, path: Path, overwrite: bool) -> None:
+    """Raises `UsageError` where a file could not be written later, or would replace one that it may not."""
+    try:
+        if path.is_dir():
+            raise UsageError(f"{flag}={path}: takes a file, which this folder is not")
+        if os.path.lexists(path) and not overwrite:
+            raise UsageError(f"{flag}={path}: is there already; takes another file, or --overwrite replaces it")
+        nearest = next(parent for parent in path.absolute().parents if parent.exists())
+        if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+            raise UsageError(f"{flag}={path}: takes a file in a folder that can be written")
+    except OSError as error:  # a name that is too long
+        raise UsageError(f"{flag}={path}: takes a file that can be written: {error.strerror}") from None
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:

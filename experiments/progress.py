@@ -1,14 +1,15 @@
 """What a run shows: a live line on a terminal, plain lines elsewhere, nothing with --quiet; a table at the end."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 # Without a terminal there is at most one line in so many seconds, besides one per evaluation.
@@ -125,6 +126,34 @@ class Display:
     def _line(self, text: str) -> None:
         self._last_line = self.clock()
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def counting(
+    what: str, total: int, console: Console, clock: Callable[[], float] = time.monotonic
+) -> Iterator[Callable[[int], None]]:
+    """Shows how much of `total` is done and how long the rest takes; gives the function that is told what is done.
+
+    On a terminal a live line that goes when all is done, elsewhere a line every `PLAIN_SECONDS`.
+    """
+    if console.is_terminal:
+        columns = (TextColumn(what), BarColumn(), TextColumn("{task.completed:,}/{task.total:,}  left"))
+        with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
+            task = bar.add_task(what, total=total)
+            yield lambda done: bar.update(task, completed=done)
+        return
+    start = last = clock()
+
+    def tell(done: int) -> None:
+        nonlocal last
+        now = clock()
+        if now - last >= PLAIN_SECONDS and 0 < done < total:
+            last = now
+            left = format_seconds((now - start) * (total - done) / done)
+            line = f"{what}: {done:,} of {total:,}, left {left}"
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    yield tell
 
 
 def evaluation_share(steps: int, evaluations: int, episodes: int, episode_length: int) -> str:

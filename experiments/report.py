@@ -35,7 +35,7 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    command_line.refuse_existing_file(options.out, options.overwrite)
+    command_line.refuse_file("--out", options.out, options.overwrite)
     from experiments import collected, described, figures, page, run_details, tabulated  # they take a second or two
 
     runs = collected.collect(options.runs)

@@ -1,13 +1,17 @@
-"""Run folders written by hand: config.json and evaluations.csv, without a training."""
+"""Run folders written by hand: config.json, evaluations.csv, policies, without a training."""
 
 import csv
 import json
 import math
+from unittest import mock
 
+import jax
 import numpy as np
 
+from experiments import described
 from experiments.records import EVALUATION_COLUMNS
-from sqt_jax.algorithms import make_config
+from sqt_jax.algorithms import agent_of, make_config
+from sqt_jax.policy import save_policy
 
 # Markup, and what no terminal should see.
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'`${1}\x1b\ud800"
@@ -78,3 +82,22 @@ def make_hostile(path):
     content["resumed"] = [{"env_steps": HOSTILE, "command": ["run", HOSTILE], "versions": {HOSTILE: HOSTILE}}]
     (path / "config.json").write_text(json.dumps(content))
     (path / "summary.json").write_text(json.dumps({"status": HOSTILE, "wall_seconds": HOSTILE}))
+
+
+def add_policies(path, env, returns=None):
+    """Gives a made run policies that have learned nothing, and a summary with the members' final `returns`.
+
+    Args:
+      env: an `Environment` of the run's sizes.
+    """
+    run = described.read(path)
+    config, count = run.members[0].config, len(run.members)
+    agent, generator = agent_of(config, env), np.random.default_rng(1)
+    shapes = jax.eval_shape(lambda key: jax.vmap(agent.init)(jax.random.split(key, count)), jax.random.key(1))
+    # by NumPy: to compile the agent's own start takes seconds
+    state = jax.tree.map(lambda leaf: generator.normal(0, 0.5, leaf.shape).astype(leaf.dtype), shapes)
+    with mock.patch("sqt_jax.policy._exported", return_value=b""):  # for use elsewhere; it takes seconds
+        save_policy(path / "policy", config, env, state)
+    if returns is not None:
+        members = [{"member": index, "final_return": value} for index, value in enumerate(returns)]
+        (path / "summary.json").write_text(json.dumps({"members": members}))

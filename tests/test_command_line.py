@@ -3,7 +3,7 @@ import argparse
 import pytest
 
 from experiments import command_line
-from experiments.command_line import Parser, UsageError, folder, guarded, one_of, whole
+from experiments.command_line import Parser, UsageError, between, folder, guarded, one_of, refuse_file, whole
 
 
 @pytest.fixture
@@ -86,18 +86,13 @@ def test_a_link_is_replaced_and_not_written_through(tmp_path):
     assert (tmp_path / "precious").read_text() == "x" and not (tmp_path / "a.csv").is_symlink()
 
 
-def test_one_file_is_refused_where_it_may_not_be_and_written_whole(tmp_path):
+def test_one_file_is_written_whole(tmp_path):
     out = tmp_path / "new" / "report.html"
-    command_line.refuse_existing_file(out, overwrite=False)
-    command_line.write_file(out, b"1")
-    with pytest.raises(UsageError, match=r"report.html: is there already; takes another file, or --overwrite"):
-        command_line.refuse_existing_file(out, overwrite=False)
-    command_line.refuse_existing_file(out, overwrite=True)
-    command_line.write_file(out, b"2")
-    assert out.read_bytes() == b"2" and [*out.parent.iterdir()] == [out]
+    for content in (b"1", b"2"):
+        command_line.write_file(out, content)
+        assert out.read_bytes() == content and [*out.parent.iterdir()] == [out]
     for path in (tmp_path, out / "below.html", tmp_path / ("x" * 300)):
         with pytest.raises(UsageError, match="--out=.*: takes a file"):
-            command_line.refuse_existing_file(path, overwrite=True)
             command_line.write_file(path, b"")
 
 
@@ -109,3 +104,36 @@ def test_what_can_be_no_file(text):
 
 def test_what_is_not_to_be_seen_is_escaped():
     assert command_line.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"
+
+
+def test_a_command_for_one_run_takes_one():
+    made = Parser("What it does.", "python -m experiments.play RUN --video=FILE", one=True)
+    made.add_argument("--seed", type=between(0, 9), metavar="N")
+    assert made.prog == "python -m experiments.play"
+    options = made.read(["play", "a", "--seed=9"])
+    assert (options.runs, options.seed) == (["a"], 9)
+    for runs in ([], ["a", "b"]):
+        with pytest.raises(UsageError, match="RUN: takes the folder of one run, as in python -m experiments.play RUN"):
+            made.read(["play", *runs])
+    for text in ("10", "-1", "1.0", "", "9" * 5000):
+        with pytest.raises(UsageError, match="--seed: takes a whole number from 0 to 9, not"):
+            made.read(["play", "a", f"--seed={text}"])
+
+
+def test_a_file_that_could_not_be_written_is_refused_before(tmp_path):
+    refuse_file("--video", tmp_path / "new" / "folder" / "film.mp4", overwrite=False)
+    (tmp_path / "film.mp4").write_text("x")
+    (tmp_path / "link.mp4").symlink_to("nowhere")
+    (tmp_path / "folder.mp4").mkdir()
+    for name in ("film.mp4", "link.mp4"):
+        refuse_file("--video", tmp_path / name, overwrite=True)
+        with pytest.raises(UsageError, match=f"--video=.*/{name}: is there already; takes another file, or --over"):
+            refuse_file("--video", tmp_path / name, overwrite=False)
+    cannot = {
+        "folder.mp4": "takes a file, which this folder is not",
+        "film.mp4/film.mp4": "takes a file in a folder that can be written",
+        "x" * 300 + ".mp4": "takes a file that can be written: File name too long",
+    }
+    for name, message in cannot.items():
+        with pytest.raises(UsageError, match=message):
+            refuse_file("--video", tmp_path / name, overwrite=True)

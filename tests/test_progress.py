@@ -8,6 +8,7 @@ from experiments.progress import (
     PLAIN_SECONDS,
     Display,
     Status,
+    counting,
     eta_seconds,
     evaluation_share,
     final_table,
@@ -102,3 +103,22 @@ def test_final_table_has_the_members_and_the_groups():
     assert rows[2] == ["0", "7", "0.5", "1.2", "2.5", "0.125"]
     assert rows[3] == ["1", "(diverged)", "8", "0.5", "1.2", "-", "-"]
     assert rows[-1] == ["mean", "+-", "std", "2", "seeds", "0.5", "1.0", "+-", "0.2", "2.0", "+-", "0.5"]
+
+
+def test_counting_without_a_terminal_is_a_line_now_and_then():
+    now, console = [0.0], make_console(terminal=False)
+    with counting("drawing, pictures", 1_000, console, clock=lambda: now[0]) as tell:
+        for done in range(1, 1_001):
+            now[0] = done / 40
+            tell(done)
+    assert console.file.getvalue().splitlines() == [
+        "drawing, pictures: 400 of 1,000, left 0:15",
+        "drawing, pictures: 800 of 1,000, left 0:05",
+    ]
+
+
+def test_counting_on_a_terminal_is_a_line_that_goes():
+    console = make_console(terminal=True)
+    with counting("drawing, pictures", 1_000, console) as tell:
+        tell(250)
+    assert "drawing, pictures" in console.file.getvalue() and "/1,000  left" in console.file.getvalue()

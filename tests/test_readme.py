@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import flags, plots, report, run, tables
+from experiments import flags, play, plots, report, run, tables
 from experiments.plan import make_plan
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
@@ -25,7 +25,7 @@ LOOKS = [
     for language, _, code in BLOCKS
     if language == "sh"
     for line in code.splitlines()
-    if re.search(r" -m experiments\.(tables|plots|report) ", line)
+    if re.search(r" -m experiments\.(tables|plots|report|play) ", line)
 ]
 
 
@@ -45,12 +45,13 @@ def test_commands_are_understood(argv, tmp_path):
 
 @pytest.mark.parametrize("argv", LOOKS, ids=lambda argv: " ".join(argv))
 def test_commands_that_look_at_runs_are_understood(argv):
-    commands = {"experiments.tables": tables, "experiments.plots": plots, "experiments.report": report}
+    modules = (tables, plots, report, play)
+    commands = {module.__name__: module for module in modules}
     assert commands[argv[0]].parser().read(argv).runs
 
 
 def test_the_readme_has_them():
-    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4 and len(LOOKS) >= 5
+    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4 and len(LOOKS) >= 7
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

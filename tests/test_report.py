@@ -75,7 +75,7 @@ def test_what_a_run_says_is_never_markup(runs, tmp_path):
         ([], "RUNS: takes folders of runs or folders above them, as in python -m experiments.report"),
         (["none"], "none: there is no such folder"),
         (["runs", "--out="], "--out: takes a file"),
-        (["runs", "--out=runs"], "--out=runs: takes a file, which this is not"),
+        (["runs", "--out=runs"], "--out=runs: takes a file, which this folder is not"),
         (["runs", "--out=runs/cheetah/td3/run/config.json/x"], "takes a file"),
         (["runs", "--statistic=median"], "--statistic: takes one of iqm, mean, not 'median'"),
         (["runs", "--referense"], "--referense: unknown flag; did you mean --reference?"),

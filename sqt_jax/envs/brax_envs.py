@@ -45,11 +45,7 @@ def pipelines(name: str) -> tuple[str, ...]:
 
 def make_brax(name: str, physics: str) -> Environment:
     """The environment `name` (with its prefix) on one of its `pipelines`."""
-    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that Brax's pipelines are no longer developed
-        from brax import envs
-
-        env = envs.get_environment(name.removeprefix(PREFIX), backend=physics)
+    env = brax_own(name, physics)
 
     def start(key: Array) -> tuple[Any, Array]:
         with jax.default_matmul_precision("highest"):  # which GPUs do not give unasked
@@ -62,6 +58,15 @@ def make_brax(name: str, physics: str) -> Environment:
         return state, state.obs, state.reward, state.done > 0
 
     return make_environment(name, env.observation_size, env.action_size, EPISODE_LENGTH, start, advance)
+
+
+def brax_own(name: str, physics: str) -> Any:
+    """Brax's own object for the environment `name` (with its prefix): a `brax.envs.Env`."""
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that Brax's pipelines are no longer developed
+        from brax import envs
+
+        return envs.get_environment(name.removeprefix(PREFIX), backend=physics)
 
 
 def _strong(tree: Any) -> Any:

@@ -1,0 +1,102 @@
+"""Episodes of a policy, state by state: what they reached, and what a film of them shows."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sqt_jax import rollout
+from sqt_jax.types import Array, Environment, TimeStep
+
+CHUNK = 50  # steps of one call: few enough for a live line, enough that a call costs nothing
+
+
+class Episode(NamedTuple):
+    shown: Any  # a pytree of [T, ...]: what `look` gave of each state in which the policy acted
+    total: float  # the undiscounted return
+    length: int  # T
+    terminated: bool  # by the task
+    truncated: bool  # by its time limit; where neither: cut off by `max_steps`
+
+
+class _Running(NamedTuple):
+    number: Array  # [] int32: steps made
+    timestep: TimeStep  # [E, ...]
+    running: Array  # [E] bool
+    totals: Array  # [E]
+    lengths: Array  # [E]
+    terminated: Array  # [E] bool: how the episode ended
+    truncated: Array  # [E] bool
+
+
+def play(
+    env: Environment,
+    policy: rollout.Policy,
+    look: Callable[[TimeStep], Any],
+    key: Array,
+    num_episodes: int = 1,
+    max_steps: int | None = None,
+    watch: Callable[[int], None] = lambda steps: None,
+) -> list[Episode]:
+    """Runs episodes side by side from the starts that `evaluate` has with this key, each to its own end.
+
+    Args:
+      policy: obs [E, O] -> action [E, A] in [-1, 1].
+      look: time step of one environment -> what is kept of it, a pytree of arrays.
+      max_steps: cuts episodes off; None leaves them the environment's length.
+      watch: told now and then how many steps each of the episodes has made at most.
+    """
+    limit = min(max_steps or env.episode_length, env.episode_length)
+
+    def body(state: _Running, _: None) -> tuple[_Running, Any]:
+        shown = jax.vmap(look)(state.timestep)
+        following, transition = rollout.step(env, state.timestep, policy)
+        running = state.running
+        number = state.number + 1
+        ended = following.terminated | following.truncated | (number >= limit)
+        made = _Running(
+            number,
+            following,
+            running & ~ended,
+            state.totals + jnp.where(running, transition.reward, 0.0),
+            state.lengths + running,
+            state.terminated | (running & following.terminated),
+            state.truncated | (running & following.truncated),
+        )
+        return made, shown
+
+    part = jax.jit(lambda state: jax.lax.scan(body, state, length=min(CHUNK, limit)))
+    no = jnp.zeros(num_episodes, bool)
+    timestep = jax.jit(lambda key: rollout.reset(env, key, num_episodes))(key)
+    nothing = jnp.zeros(num_episodes), jnp.zeros(num_episodes, jnp.int32)
+    state = _Running(jnp.zeros((), jnp.int32), timestep, ~no, *nothing, no, no)
+    parts = []
+    while bool(state.running.any()):
+        state, shown = part(state)
+        parts.append(jax.device_get(shown))
+        watch(min(int(state.number), limit))
+    shown = jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
+    return [
+        Episode(
+            jax.tree.map(lambda x, i=i, length=length: x[:length, i], shown),
+            float(state.totals[i]),
+            int(length),
+            bool(state.terminated[i]),
+            bool(state.truncated[i]),
+        )
+        for i, length in enumerate(np.asarray(state.lengths))
+    ]
+
+
+def configuration(timestep: TimeStep) -> tuple[Array, Array]:
+    """For `look`: qpos [nq] and qvel [nv] of one of Gymnasium's tasks, on any physics."""
+    return timestep.state.task.qpos, timestep.state.task.qvel
+
+
+def ending(episode: Episode) -> str:
+    """How it ended, in words."""
+    if episode.terminated:
+        return "terminated by the task"
+    return "ended by the time limit" if episode.truncated else "cut off"

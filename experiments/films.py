@@ -1,0 +1,136 @@
+"""Pictures as a film: MP4 (H.264), GIF, or a page of HTML that holds the MP4."""
+
+import base64
+import contextlib
+import html
+import io
+import math
+import subprocess
+import tempfile
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from experiments import files
+
+FORMATS = ("mp4", "gif", "html")
+MOST_FRAMES = 60  # a second: screens show no more
+# The delay between a GIF's pictures is in 1/100 s, and browsers slow down those below 2.
+GIF_UNIT, GIF_LEAST = Fraction(1, 100), 2
+QUALITY = 18  # x264's rate factor: 0 is lossless, 23 its default; from about 18 down nobody sees a difference
+
+
+def format_of(path: Path) -> str:
+    """The format that a file's name asks for. Raises `ValueError` where it is none of `FORMATS`."""
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix not in FORMATS or not path.stem:
+        raise ValueError(f"takes a file with the ending {', '.join(f'.{name}' for name in FORMATS)}")
+    return suffix
+
+
+def stride(period: float, name: str) -> int:
+    """Of states that are `period` seconds apart, each how many-th is shown so that the film runs in real time."""
+    exact = _fraction(period)
+    if name != "gif":
+        return math.ceil(1 / (MOST_FRAMES * exact))
+    least = math.ceil(GIF_LEAST * GIF_UNIT / exact)
+    whole = [k for k in range(least, 10 * least) if (k * exact / GIF_UNIT).denominator == 1]
+    return next(iter(whole), least)
+
+
+def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str = "") -> bytes:
+    """A film of pictures [H, W, 3] uint8, all of one size (even numbers), that are shown for `period` seconds each.
+
+    Args:
+      name: one of `FORMATS`.
+      caption: shown by a page of HTML.
+
+    Raises:
+      ValueError: there are no pictures, or not of such a size.
+      OSError: the film cannot be encoded.
+    """
+    pictures = iter(frames)
+    first = next(pictures, None)
+    if first is None:
+        raise ValueError("a film needs a picture")
+    height, width, _ = first.shape
+    if height % 2 or width % 2:
+        raise ValueError(f"a film takes even numbers of pixels, not {width}x{height}")
+    pictures = chain([first], pictures)
+    if name == "gif":
+        return _gif(pictures, period)
+    film = _mp4(pictures, (width, height), period)
+    return _page(film, (width, height), caption) if name == "html" else film
+
+
+def write(path: Path, frames: Iterable[np.ndarray], period: float, caption: str = "") -> int:
+    """Writes a film in the format of the file's name, whole or not at all; its bytes. Raises as `encode`."""
+    content = encode(frames, period, format_of(path), caption)
+    with files.whole_file(path) as file:
+        return file.write(content)
+
+
+def _mp4(frames: Iterable[np.ndarray], size: Sequence[int], period: float) -> bytes:
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    try:
+        command = [get_ffmpeg_exe(), "-v", "error"]
+    except RuntimeError:
+        raise OSError("imageio-ffmpeg brings no ffmpeg for this machine") from None
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(1 / _fraction(period))]
+    command += ["-i", "-", "-an", "-vcodec", "libx264", "-crf", str(QUALITY), "-pix_fmt", "yuv420p"]
+    command += ["-movflags", "+faststart", "film.mp4"]  # the index first, so that a film plays while it loads
+    with tempfile.TemporaryDirectory() as folder, Path(folder, "errors").open("wb") as errors:
+        # Not by imageio_ffmpeg.write_frames, which forks: JAX's threads do not bear that. A session of its own, so that
+        # Ctrl-C is this process's alone.
+        process = subprocess.Popen(
+            command, cwd=folder, stdin=subprocess.PIPE, stdout=errors, stderr=errors, start_new_session=True
+        )
+        assert process.stdin is not None
+        try:
+            with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # where it has ended, its exit code tells
+                for frame in frames:
+                    pipe.write(np.ascontiguousarray(frame, np.uint8).data)
+        except BaseException:
+            process.kill()
+            raise
+        finally:
+            process.wait()
+        if process.returncode:
+            said = Path(folder, "errors").read_text(errors="replace")
+            raise OSError(f"ffmpeg: {' '.join(said.split())[:300]}")
+        return Path(folder, "film.mp4").read_bytes()
+
+
+def _gif(frames: Iterable[np.ndarray], period: float) -> bytes:
+    from PIL import Image
+
+    images = (Image.fromarray(frame) for frame in frames)
+    stream = io.BytesIO()
+    milliseconds = round(1000 * period)
+    next(images).save(stream, "GIF", save_all=True, append_images=images, duration=milliseconds, loop=0)
+    return stream.getvalue()
+
+
+def _page(film: bytes, size: Sequence[int], caption: str) -> bytes:
+    width, height = size
+    text = html.escape(caption)
+    data = base64.b64encode(film).decode("ascii")
+    return f"""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<title>{text}</title>
+<style>body {{ font-family: sans-serif; margin: 2em }} video {{ max-width: 100%; height: auto }}</style>
+<video width="{width}" height="{height}" controls autoplay loop muted playsinline
+ src="data:video/mp4;base64,{data}"></video>
+<p>{text}</p>
+</html>
+""".encode()
+
+
+def _fraction(period: float) -> Fraction:
+    """The seconds that were meant: 1/20, not the float next to it."""
+    return Fraction(period).limit_denominator(1_000_000)

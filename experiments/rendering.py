@@ -1,0 +1,68 @@
+"""Pictures of a MuJoCo model in given configurations, drawn off screen.
+
+Which OpenGL draws is decided when MuJoCo is imported: set MUJOCO_GL before (`graphics.choose`).
+"""
+
+import copy
+from collections.abc import Iterable, Iterator, Sequence
+
+import mujoco
+import numpy as np
+
+TRACKING = "track"  # the camera that follows the robot, in the models of Gymnasium's locomotion tasks
+
+DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees, of a camera of our own: from where Gymnasium's look
+SHADOW_TEXELS = 1024  # as fine as the pictures are; MuJoCo's 4096 double the time that software takes to draw one
+
+
+def cameras(model: mujoco.MjModel) -> list[str]:
+    """The names of a model's cameras."""
+    return [name for i in range(model.ncam) if (name := model.camera(i).name)]
+
+
+def frames(
+    model: mujoco.MjModel, configurations: Iterable[np.ndarray], size: Sequence[int] = (640, 480), camera: str = ""
+) -> Iterator[np.ndarray]:
+    """One picture [height, width, 3] uint8 of each configuration qpos [nq]; each is an array of its own.
+
+    Args:
+      size: width and height in pixels.
+      camera: the name of one of the model's `cameras`; empty: `TRACKING`, or a free one that follows the robot.
+
+    Raises:
+      ValueError: the model has no such camera.
+    """
+    view = view_of(model, camera)
+    width, height = size
+    model = copy.copy(model)
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height  # MuJoCo draws nothing larger
+    model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, SHADOW_TEXELS)
+    data = mujoco.MjData(model)
+    with mujoco.Renderer(model, height, width) as renderer:
+        for qpos in configurations:
+            data.qpos[:] = qpos
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, view)
+            yield renderer.render().copy()
+
+
+def view_of(model: mujoco.MjModel, camera: str = "") -> mujoco.MjvCamera:
+    """MuJoCo's description of a camera of this name; see `frames`."""
+    names = cameras(model)
+    view = mujoco.MjvCamera()
+    if camera and camera not in names:
+        raise ValueError(f"takes one of {', '.join(names) or 'no names: the model has no cameras'}, not {camera!r}")
+    if camera or TRACKING in names:
+        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        view.fixedcamid = model.camera(camera or TRACKING).id
+        return view
+    return following(model, view)
+
+
+def following(model: mujoco.MjModel, view: mujoco.MjvCamera) -> mujoco.MjvCamera:
+    """Makes `view` one that follows the robot and can be turned by hand."""
+    mujoco.mjv_defaultFreeCamera(model, view)  # from as far as the whole floor is wide
+    view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+    view.trackbodyid = min(1, model.nbody - 1)
+    view.distance, view.elevation = DISTANCE, ELEVATION
+    return view

@@ -1,0 +1,186 @@
+"""The command that shows a policy: what it prints is what an evaluation gives, and the film is of that."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from made_runs import add_policies, write_run
+
+import sqt_jax
+from experiments import graphics, play, rendering
+from sqt_jax import envs
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run of two seeds, 3 and 5, of which 5 is the better; one of Brax's; and a folder of another kind."""
+    folder = tmp_path_factory.mktemp("runs")
+    path = write_run(folder, "td3", "hopper", [[0, 1], [0, 2]], seeds=(3, 5), hidden=(8, 8))
+    add_policies(path, envs.make("hopper", "mujoco"), [1, 2])
+    write_run(folder, "td3", "brax:inverted_pendulum", physics="spring", hidden=(8, 8))
+    (folder / "results").mkdir()
+    (folder / "results" / "table.md").write_text("none")
+    return folder
+
+
+@pytest.fixture
+def folder(made, tmp_path, monkeypatch):
+    """The working directory, with the runs in it and without a display."""
+    shutil.copytree(made, tmp_path / "runs")
+    (tmp_path / "there.mp4").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+RUN = "runs/hopper/td3/run"
+BRAX = "runs/brax:inverted_pendulum/td3/run"
+
+
+@pytest.fixture
+def pictures(monkeypatch):
+    """Rendering without OpenGL: the configurations that would be drawn, as blank pictures."""
+    drawn = []
+
+    def frames(model, configurations, size, camera):
+        for qpos in configurations:
+            drawn.append(qpos)
+            yield np.full((size[1], size[0], 3), 100, np.uint8)
+
+    monkeypatch.setattr(rendering, "frames", frames)
+    monkeypatch.setattr(graphics, "choose", lambda: "glfw")
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    return drawn
+
+
+def printed(text):
+    """The returns and lengths of the lines of episodes."""
+    rows = re.findall(r"episode \d+: return ([-\d.,]+), ([\d,]+) steps", text)
+    return [float(total.replace(",", "")) for total, _ in rows], [int(length.replace(",", "")) for _, length in rows]
+
+
+def test_the_returns_are_an_evaluations_and_the_film_is_of_those_episodes(folder, pictures, capsys):
+    argv = ["play", RUN, "--episodes=3", "--start_seed=7", "--size=32x16", "--video=new/folder/film.mp4"]
+    assert play.main(argv) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(
+        "td3 on hopper: member 1, seed 5 (the best of 2 at the last evaluation)\nphysics mujoco, start seed 7\n"
+    )
+    policy = sqt_jax.load_policy(f"{RUN}/policy", member=1)
+    returns, lengths = sqt_jax.evaluate_policy(policy, envs.make("hopper", "mujoco"), num_episodes=3, seed=7)
+    totals, steps = printed(out)
+    np.testing.assert_allclose(totals, returns, atol=0.051)
+    assert steps == lengths.tolist() and out.count("terminated by the task") == 3
+    # 8 ms a step: one state in three is 41.67 pictures a second
+    count = sum(-(-length // 3) for length in steps)
+    assert f"new/folder/film.mp4: 32x16, {count} pictures, 41.67 per second (one state in 3), 0.0" in out
+    assert len(pictures) == count and pictures[0].shape == (6,) and (abs(pictures[0][2:]) < 0.006).all()
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs("new/folder/film.mp4")
+    assert frames == count and seconds == pytest.approx(count * 0.024, abs=0.03)
+
+
+def test_a_member_is_asked_for_and_steps_are_limited(folder, capsys):
+    assert play.main(["play", RUN, "--seed=3", "--steps=4"]) == 0
+    out = capsys.readouterr().out
+    assert "member 0, seed 3 (of 2)" in out and "4 steps, 0.0 s, cut off" in out
+    assert out.endswith("no display here: --video=FILE films it\n")
+
+
+def test_where_there_is_a_display_mujocos_viewer_shows_it(folder, capsys, monkeypatch):
+    from experiments import viewer
+
+    shown = []
+
+    def show(*arguments):
+        shown.append(arguments)
+        raise RuntimeError("not on this system")
+
+    monkeypatch.setattr(graphics, "has_display", lambda: True)
+    monkeypatch.setattr(graphics, "works", lambda name: name == "glfw")
+    monkeypatch.setattr(viewer, "show", show)
+    assert play.main(["play", RUN, "--steps=4", "--camera=track"]) == 2
+    (_, ((qpos, qvel),), period, camera) = shown[0]
+    assert (qpos.shape, qvel.shape, camera) == ((4, 6), (4, 6), "track") and period == pytest.approx(0.008)
+    assert "cannot be shown in MuJoCo's viewer (not on this system); --video=FILE" in capsys.readouterr().err
+
+
+REFUSED = [
+    ("", "RUN: takes the folder of one run, as in"),
+    (f"{RUN} {BRAX}", "RUN: takes the folder of one run, as in"),
+    ("none", "none: there is no such folder"),
+    ("there.mp4", "there.mp4: there is no such folder"),
+    ("runs", "runs: takes the folder of a run; it has no config.json"),
+    ("runs/results --video=film.mp4", "runs/results: takes the folder of a run; it has no config.json"),
+    (f"{RUN} --seed=4", "--seed=4: takes a seed of the run, one of 3, 5"),
+    (f"{RUN} --seed=-1", "--seed: takes a whole number from 0 to 4294967295, not '-1'"),
+    (f"{RUN} --seed=" + "9" * 5000, "--seed: takes a whole number"),
+    (f"{RUN} --member=2", "--member=2: takes one of the run's members, 0 to 1"),
+    (f"{RUN} --seed=3 --member=1", "--seed=3: member 1 has seed 5"),
+    (f"{RUN} --episodes=0", "--episodes: takes a whole number from 1 to 1000, not '0'"),
+    (f"{RUN} --steps=many", "--steps: takes a whole number from 1"),
+    (f"{RUN} --physics=mujco", "--physics=mujco: takes one of mjx, mujoco, warp"),
+    (f"{RUN} --video=film.avi", "--video: takes a file with the ending .mp4, .gif, .html, not 'film.avi'"),
+    (f"{RUN} --video=film", "--video: takes a file with the ending"),
+    (f"{RUN} --video=", "--video: takes a file with the ending"),
+    (f"{RUN} --video=a\0b.mp4", "--video: takes a file, not 'a\\x00b.mp4'"),
+    (f"{RUN} --video=there.mp4", "--video=there.mp4: is there already; takes another file, or --overwrite"),
+    (f"{RUN} --video=there.mp4/film.mp4", "--video=there.mp4/film.mp4: takes a file in a folder that can be written"),
+    (f"{RUN} --size=640", "--size: takes WIDTHxHEIGHT, not '640'"),
+    (f"{RUN} --size=641x480", "--size: takes even numbers from 16 to 4096, not '641x480'"),
+    (f"{RUN} --size=0x99999", "--size: takes even numbers from 16 to 4096"),
+    (f"{RUN} --camera=side", "--camera=side: takes one of track, not 'side'"),
+    (f"{RUN} --vidio=film.mp4", "--vidio: unknown flag; did you mean --video?"),
+    (f"{BRAX} --video=film.mp4", "--video=film.mp4: takes a file with the ending .html, as brax:inverted_pendulum"),
+    (f"{BRAX} --physics=mujoco", "--physics=mujoco: takes one of mjx, generalized, spring, positional"),
+    (f"{BRAX} --camera=track", "--camera=track: Brax's viewer has its own"),
+]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize(("arguments", "says"), REFUSED, ids=[ascii(row[0])[1:60] for row in REFUSED])
+def test_what_cannot_be_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
+    before = sorted(folder.rglob("*"))
+    assert play.main(["play", *(word for word in arguments.split(" ") if word)]) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith(says) and err.count("\n") == 1 and err[:-1].isprintable() and not out
+    assert sorted(folder.rglob("*")) == before and (folder / "there.mp4").read_text() == "mine"
+
+
+def test_without_opengl_it_is_said_before_anything_is_played(folder, capsys, monkeypatch):
+    def none():
+        raise graphics.NoGraphics("no OpenGL works here")
+
+    monkeypatch.setattr(graphics, "choose", none)
+    assert play.main(["play", RUN, "--video=film.mp4"]) == 2
+    assert capsys.readouterr() == ("", "--video=film.mp4: no OpenGL works here\n")
+    assert not Path("film.mp4").exists()
+
+
+def test_an_interrupt_is_no_traceback(monkeypatch):
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(play, "command", interrupted)
+    assert play.main(["play", RUN]) == 130
+
+
+def test_a_film_from_the_command_line(folder):
+    try:
+        graphics.choose()
+    except graphics.NoGraphics as error:
+        pytest.skip(str(error))
+    command = [sys.executable, "-m", "experiments.play", str(folder / RUN), "--steps=10", "--size=64x48"]
+    command += [f"--video={folder / 'there.mp4'}", "--overwrite"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=dict(os.environ))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "there.mp4: 64x48, 4 pictures" in done.stdout
+    assert imageio_ffmpeg.count_frames_and_secs(folder / "there.mp4")[0] == 4

@@ -1,0 +1,135 @@
+"""Which member of a run is meant, and that its policy is one for the task."""
+
+import json
+import math
+import shutil
+
+import probe_envs
+import pytest
+from made_runs import add_policies, write_run
+
+from experiments import policies
+from experiments.command_line import UsageError
+from sqt_jax import envs
+
+NAN = math.nan
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Seeds 3 and 5 times two coefficients: members 0 to 3 are (3, 0.1), (5, 0.1), (3, 0.5), (5, 0.5)."""
+    folder = tmp_path_factory.mktemp("runs")
+    swept = {"penalty_coef": (0.1, 0.5)}
+    path = write_run(folder, "td3_sqt", "hopper", [[0, 1]] * 4, seeds=(3, 5), swept=swept, hidden=(8, 8))
+    add_policies(path, envs.make("hopper", "mujoco"), [10, 40, 30, 20])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("returns", "asked", "member", "why"),
+    [
+        ([10, 40, 30, 20], {}, 1, "the best of 4 at the last evaluation"),
+        ([10, NAN, 30, 20], {}, 2, "the best of 4 at the last evaluation"),
+        ([NAN] * 4, {}, 0, "the first of 4: none has an evaluation"),
+        ([10, 40, 30, 20], {"seed": 3}, 2, "the best of 2 with this seed at the last evaluation"),
+        ([NAN] * 4, {"seed": 5}, 1, "the first of 2 with this seed: none has an evaluation"),
+        ([10, 40, 30, 20], {"number": 0}, 0, "of 4"),
+        ([10, 40, 30, 20], {"number": 3, "seed": 5}, 3, "of 4"),
+    ],
+)
+def test_the_best_is_chosen_of_those_that_are_asked_for(run, returns, asked, member, why):
+    chosen = policies.choose(policies.read(run), returns, **asked)
+    assert (chosen.number, chosen.why) == (member, why)
+    assert chosen.member.seed == (3, 5)[member % 2]
+    assert chosen.member.config.agent.penalty_coef == (0.1, 0.5)[member // 2]
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"seed": 4}, "--seed=4: takes a seed of the run, one of 3, 5"),
+        ({"number": 4}, "--member=4: takes one of the run's members, 0 to 3"),
+        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; takes --seed or --member"),
+    ],
+)
+def test_members_that_the_run_has_not(run, asked, says):
+    with pytest.raises(UsageError) as error:
+        policies.choose(policies.read(run), [NAN] * 4, **asked)
+    assert str(error.value) == says
+
+
+def test_what_is_told(run):
+    described = policies.read(run)
+    chosen = policies.choose(described, policies.final_returns(run, 4))
+    says = "td3_sqt on hopper: member 1, seed 5, penalty_coef 0.1 (the best of 4 at the last evaluation)"
+    assert policies.told(described, chosen) == says
+
+
+@pytest.mark.parametrize(
+    ("content", "returns"),
+    [
+        ({"members": [{"member": 1, "final_return": 5}, {"member": 0, "final_return": None}]}, [NAN, 5.0]),
+        ({"members": [{"member": 7, "final_return": 5}, {"member": True, "final_return": 5}]}, [NAN, NAN]),
+        ({"members": [{"member": 0, "final_return": "many"}]}, [NAN, NAN]),
+        ({"members": [3]}, [NAN, NAN]),
+        ([], [NAN, NAN]),
+        (None, [NAN, NAN]),
+    ],
+)
+def test_returns_of_a_summary_that_may_be_damaged(tmp_path, content, returns):
+    if content is not None:
+        (tmp_path / "summary.json").write_text(json.dumps(content))
+    found = policies.final_returns(tmp_path, 2)
+    assert [math.isnan(value) for value in found] == [math.isnan(value) for value in returns]
+    assert [value for value in found if value == value] == [value for value in returns if value == value]
+
+
+def test_the_policy_of_the_member_is_loaded(run):
+    env = envs.make("hopper", "mujoco")
+    described = policies.read(run)
+    actions = []
+    for number in (0, 1):
+        policy = policies.load(run, policies.choose(described, [NAN] * 4, number=number), env)
+        actions.append(policy([[0.5] * 11]))
+    assert actions[0].shape == (1, 3) and not (actions[0] == actions[1]).any()
+
+
+def no_policy(path):
+    shutil.rmtree(path / "policy")
+
+
+def no_member(path):
+    (path / "policy" / "member_1.npz").unlink()
+
+
+def damaged(path):
+    (path / "policy" / "member_1.npz").write_bytes(b"PK")
+
+
+def other_sizes(path):
+    shutil.rmtree(path / "policy")
+    add_policies(path, probe_envs.constant_reward())
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (no_policy, "takes a run with a policy, which is saved when training ends; it has none yet"),
+        (no_member, "member_1.npz: there is no such file"),
+        (damaged, "member_1.npz: not the parameters of a policy"),
+        (other_sizes, "policy: is not a policy for hopper: its sizes are 2 and 1"),
+    ],
+)
+def test_a_policy_that_cannot_be_played_is_refused_in_a_line(run, tmp_path, change, says):
+    path = tmp_path / "run"
+    shutil.copytree(run, path)
+    change(path)
+    chosen = policies.choose(policies.read(path), policies.final_returns(path, 4))
+    with pytest.raises(UsageError) as error:
+        policies.load(path, chosen, envs.make("hopper", "mujoco"))
+    assert says in str(error.value) and str(error.value).startswith(str(path)) and str(error.value).isprintable()
+
+
+def test_what_is_no_run_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="takes the folder of a run; it has no config.json that can be read"):
+        policies.read(tmp_path)
