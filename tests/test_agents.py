@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from algorithm_rows import KINDS
+from algorithm_rows import KINDS, ONE_OF_EACH
 
 from sqt_jax import networks
 from sqt_jax.agents import sac, td3, td7
@@ -136,7 +136,8 @@ def test_a_variant_starts_exactly_as_its_base(algo):
 
 
 OWN_SIZES = [(algo, row.settings.get("ensemble_size", AgentConfig.ensemble_size)) for algo, row in ALGORITHMS.items()]
-SIZES = OWN_SIZES + [(algo, n) for algo in KINDS for n in (1, 5) if n > 1 or algo in PLAIN]
+SIZES = [*OWN_SIZES, *((algo, 1) for algo in BASES), *((algo, 5) for algo in ONE_OF_EACH)]
+SIZES += [pytest.param(algo, 5, marks=pytest.mark.slow) for algo in KINDS if algo not in ONE_OF_EACH]
 
 
 @pytest.mark.parametrize(("algo", "n"), SIZES)
@@ -312,7 +313,7 @@ def test_a_sampled_actor_acts_by_its_mode_and_learns_from_its_samples():
     ("algo", "n"),
     [
         ("td3_sqt", 3),
-        ("redq_sqt", 10),
+        pytest.param("redq_sqt", 10, marks=pytest.mark.slow),
         pytest.param("sac_sqt_tuple", 2, marks=pytest.mark.slow),
         pytest.param("maxmin_sqt", 4, marks=pytest.mark.slow),
     ],

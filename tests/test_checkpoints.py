@@ -66,7 +66,7 @@ def listing(store):
     return sorted(path.name for path in store.path.iterdir())
 
 
-@algorithm_rows.every()
+@algorithm_rows.every(fast=algorithm_rows.ONE_OF_EACH)
 def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)

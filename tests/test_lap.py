@@ -141,7 +141,7 @@ WEIGHTS = {
 
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_rows_are_drawn_with_their_exact_probabilities(name):
-    weights, draws = WEIGHTS[name], 100_000
+    weights, draws = WEIGHTS[name], 40_000
     rows = np.asarray(drawer(draws)(jax.random.key(3), build(weights)))
     assert rows.min() >= 0 and rows.max() < len(weights)
     probability = weights / weights.sum()

@@ -1,3 +1,4 @@
+import algorithm_rows
 import jax
 import pytest
 from probe_envs import constant_reward
@@ -19,7 +20,7 @@ def test_every_preset_is_a_configuration_for_every_algorithm_and_environment(pre
             assert {name: flat[name] for name in settings} == settings
 
 
-@pytest.mark.parametrize("algo", NINE)
+@algorithm_rows.every(NINE, fast=algorithm_rows.ONE_OF_EACH)
 def test_the_released_preset_makes_a_whole_run(algo):
     """Traced, not compiled; the updates themselves: test_golden."""
     tiny = {"hidden": (5, 4), "embedding_size": 6, "steps": 1000, "warmup_steps": 300, "eval_every": 500}
