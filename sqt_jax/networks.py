@@ -123,16 +123,28 @@ def network(module: nn.Module) -> Network:
     return Network(module.init, module.apply)
 
 
-def ensemble_of(module: type[nn.Module], ensemble_size: int) -> Callable[..., nn.Module]:
-    """N independent modules as one: parameters and outputs get a leading axis N, inputs are shared."""
-    return nn.vmap(
+def ensemble(module: type[nn.Module], ensemble_size: int, hidden: Sequence[int]) -> Network:
+    """N independent modules as one: parameters and outputs get a leading axis N, inputs are shared.
+
+    Each gets its own copy of the inputs: a first layer of all of them at once would give [B, N, width], and XLA would
+    turn that, and its kernel, round.
+    """
+    made = nn.vmap(
         module,
-        in_axes=None,
+        in_axes=0,
         out_axes=0,
         axis_size=ensemble_size,
         variable_axes={"params": 0},
         split_rngs={"params": True},
-    )
+    )(hidden)
+
+    def each(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(key_or_params: Any, *inputs: Array) -> Any:
+            return function(key_or_params, *(jnp.broadcast_to(x, (ensemble_size, *x.shape)) for x in inputs))
+
+        return call
+
+    return Network(each(made.init), each(made.apply))
 
 
 def actor(action_size: int, hidden: Sequence[int], gaussian: bool) -> Network:
@@ -142,4 +154,4 @@ def actor(action_size: int, hidden: Sequence[int], gaussian: bool) -> Network:
 
 def critic_ensemble(ensemble_size: int, hidden: Sequence[int]) -> Network:
     """N independent critics as one: obs [B, O], action [B, A] -> [N, B]"""
-    return network(ensemble_of(Critic, ensemble_size)(hidden))
+    return ensemble(Critic, ensemble_size, hidden)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 
-from sqt_jax.networks import Dense, Gaussian, Network, clip_log_std, ensemble_of, network
+from sqt_jax.networks import Dense, Gaussian, Network, clip_log_std, ensemble, network
 from sqt_jax.types import Array, Params
 
 
@@ -104,4 +104,4 @@ def sale_actor(action_size: int, hidden: Sequence[int], gaussian: bool = False) 
 
 def sale_critics(ensemble_size: int, hidden: Sequence[int]) -> Network:
     """N independent critics as one: -> [N, B]"""
-    return network(ensemble_of(SaleCritic, ensemble_size)(hidden))
+    return ensemble(SaleCritic, ensemble_size, hidden)
