@@ -68,7 +68,7 @@ class Checkpoints:
         except OSError as error:
             self._failed(position.env_steps, error)
             return
-        arrays = {name: _host_copy(leaf) for name, leaf in by_path(self._without_rows(state)).items()}
+        arrays = {name: _host_copy(leaf) for name, leaf in _held(self._without_rows(state)).items()}
         arguments = (Step(position.env_steps, len(same)), arrays, storage.shape[1], position, lengths)
         self._writer = threading.Thread(target=self._write, args=arguments, daemon=True)
         self._writer.start()
@@ -171,7 +171,7 @@ class Checkpoints:
     def _read(self, step: Step, manifest: Manifest, template: TrainState) -> TrainState:
         """The state of a checkpoint whose files have been verified."""
         rest = self._without_rows(template)
-        expected = {name: _on_host(leaf) for name, leaf in by_path(rest).items()}
+        expected = {name: _on_host(leaf) for name, leaf in _held(rest).items()}
         folder = (self.path / step.name / "state").absolute()
         try:
             there = _shapes_on_disk(folder)
@@ -182,8 +182,9 @@ class Checkpoints:
             raise
         except Exception as error:  # whatever Orbax says of a folder that is not its own
             raise Refused(f"Orbax cannot read its checkpoint ({type(error).__name__})") from None
-        leaves = {name: _on_device(arrays[name], leaf) for name, leaf in by_path(rest).items()}
-        state = from_paths(rest, leaves)
+        empty = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in by_path(rest).items() if not leaf.size}
+        leaves = {name: _on_device(arrays[name], leaf) for name, leaf in _held(rest).items()}
+        state = from_paths(rest, leaves | empty)
         if int(state.env_steps) != step.env_steps:
             raise Refused(f"its checkpoint at step {step.env_steps:,} is of step {int(state.env_steps):,}")
         shape = self.replay.storage(template.replay).shape
@@ -213,6 +214,11 @@ def _orbax() -> Any:
 def _shapes_on_disk(folder: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     metadata = _orbax().metadata(folder).item_metadata.tree
     return {name: (tuple(leaf.shape), np.dtype(leaf.dtype).name) for name, leaf in metadata.items()}
+
+
+def _held(state: TrainState) -> dict[str, Any]:
+    """The leaves by name, but for those without entries, such as Brax's environments carry: Orbax refuses them."""
+    return {name: leaf for name, leaf in by_path(state).items() if leaf.size}
 
 
 def _is_key(leaf: Any) -> bool:

@@ -296,3 +296,16 @@ def test_keys_come_back_as_keys(case, tmp_path):
     key = store.restore(case.template).state.key
     assert jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(case.trained(40).key))
+
+
+def test_arrays_without_entries_come_back_too(case, tmp_path):
+    """Brax's environments carry some."""
+
+    def with_one(state):
+        return state._replace(timestep=(state.timestep, jnp.zeros((len(SEEDS), 0, 2), jnp.int32)))
+
+    store, state = case.store(tmp_path), with_one(case.trained(60))
+    store.save(state, position(60), LENGTHS)
+    store.wait()
+    assert case.said == []
+    assert identical(store.restore(jax.eval_shape(lambda: with_one(start(case.config, case.sweep)))).state, state)
