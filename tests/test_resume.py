@@ -1,5 +1,6 @@
 """A run that is gone on with ends as if it had never stopped."""
 
+import itertools
 import json
 import os
 import signal
@@ -206,17 +207,22 @@ def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("physics", ["mjx", "mujoco"])
-@pytest.mark.parametrize("algo", ["td3_sqt", "sac_sqt_tuple", "td7_sqt"])
-def test_the_command_resumes_on_every_physics(tmp_path, algo, physics):
-    command = [sys.executable, "-m", "experiments.run", f"--algo={algo}", "--env=cheetah", f"--physics={physics}"]
+@pytest.mark.parametrize(
+    ("algo", "env", "physics"),
+    [
+        *itertools.product(["td3_sqt", "sac_sqt_tuple", "td7_sqt"], ["cheetah"], ["mjx", "mujoco"]),
+        ("td3_sqt", "brax:reacher", "mjx"),
+    ],
+)
+def test_the_command_resumes_on_every_physics(tmp_path, algo, env, physics):
+    command = [sys.executable, "-m", "experiments.run", f"--algo={algo}", f"--env={env}", f"--physics={physics}"]
     command += ["--seeds=0,1", "--warmup_steps=50", "--eval_every=60", "--eval_episodes=1", "--batch_size=16"]
     command += ["--hidden=16,16", "--checkpoint_every=30", "--name=run", "--quiet"]
 
     def train(folder, *more):
         done = subprocess.run([*command, f"--out={folder}", *more], capture_output=True, text=True, timeout=600)
         assert (done.returncode, done.stderr) == (0, "")
-        return folder / "cheetah" / algo / "run"
+        return folder / env / algo / "run"
 
     whole = train(tmp_path / "whole", "--steps=150", "--replay_capacity=90")
     train(tmp_path / "parts", "--steps=120", "--replay_capacity=90")
