@@ -1,5 +1,6 @@
 """Throughput of each part: `python -m experiments.bench --suites=env,update,loop --members=1,5`.
 
+Operations are those of the matrix products, and their peak is measured in the same run (`operations`).
 Each figure is the median over `--repeats` timed calls of a compiled loop that runs for about `--seconds`, after a
 first call that compiles. The suites of one process run one after the other; compare figures of one run only, since a
 machine's speed changes with what else it does.
@@ -19,7 +20,7 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import runtime
+from experiments import operations, runtime
 from experiments.measure import (
     REPLAYS,
     Row,
@@ -138,11 +139,19 @@ def ratios(all_rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def markdown(all_rows: Sequence[Row]) -> str:
-    lines = ["| suite | what | members | rate | unit | compile s |", "|---|---|---|---|---|---|"]
-    for r in all_rows:
-        lines.append(f"| {r.suite} | {r.what} | {r.members} | {r.rate:,.0f} | {r.unit}/s | {r.compile_seconds:.1f} |")
-    return "\n".join(lines)
+HEADER = ("suite", "what", "members", "rate", "unit", "compile s", "GFLOP", "of the peak")
+
+
+def cells(row: Row, peak: float) -> tuple[str, ...]:
+    """The row under `HEADER`; the last two are empty where operations were not counted."""
+    counted = (f"{row.operations / 1e9:.3g}", f"{row.rate * row.operations / peak:.0%}") if row.operations else ("", "")
+    rate = f"{row.rate:,.0f}"
+    return (row.suite, row.what, str(row.members), rate, f"{row.unit}/s", f"{row.compile_seconds:.1f}", *counted)
+
+
+def markdown(all_rows: Sequence[Row], peak: float) -> str:
+    lines = [HEADER, ("---",) * len(HEADER), *(cells(row, peak) for row in all_rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -157,15 +166,18 @@ def main(argv: Sequence[str]) -> None:
     for row in rows(FLAGS.suites, physics_here(), seconds=FLAGS.seconds, repeats=FLAGS.repeats):
         found.append(row)
         console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
-    table = Table("suite", "what", "members", "rate", "unit", "compile s", title="median of repeats")
-    for r in found:
-        cells = (str(r.members), f"{r.rate:,.0f}", f"{r.unit}/s", f"{r.compile_seconds:.1f}")
-        table.add_row(r.suite, r.what, *cells)
+    peak = 0.0
+    if any(row.operations for row in found):
+        peak = operations.peak(seconds=FLAGS.seconds, repeats=FLAGS.repeats)
+        console.print(f"peak of matrix products: {peak / 1e9:,.0f} GFLOP/s", highlight=False)
+    table = Table(*HEADER, title="median of repeats")
+    for row in found:
+        table.add_row(*cells(row, peak))
     console.print(table)
-    print(markdown(found))
+    print(markdown(found, peak))
     print("\n".join(ratios(found)))
     if FLAGS.json:
-        report = {"machine": machine(), "rows": [dataclasses.asdict(row) for row in found]}
+        report = {"machine": machine(), "peak": peak, "rows": [dataclasses.asdict(row) for row in found]}
         Path(FLAGS.json).write_text(json.dumps(report, indent=1) + "\n")
 
 

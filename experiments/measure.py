@@ -3,7 +3,6 @@
 import concurrent.futures
 import dataclasses
 import functools
-import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -14,6 +13,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout as rollout_c
 
+from experiments import operations
+from experiments.timing import measure, measure_in_turns
 from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.envs import gym_table, gym_tasks
 from sqt_jax.envs.physics import mujoco_c
@@ -32,30 +33,7 @@ class Row:
     unit: str
     rate: float
     compile_seconds: float
-
-
-def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
-    """Iterations per second of `run(iterations)` (median), and the seconds of the first call, which compiles."""
-    return measure_in_turns([run], seconds, repeats)[0]
-
-
-def measure_in_turns(runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int) -> list[tuple[float, float]]:
-    """`measure` of each, one timed call of every one in turn: a machine that slows down does so for all of them."""
-
-    def timed(run: Callable[[int], Any], iterations: int) -> float:
-        start = time.perf_counter()
-        jax.block_until_ready(run(iterations))
-        return time.perf_counter() - start
-
-    compile_seconds = [timed(run, 1) for run in runs]
-    counts = []
-    for run in runs:
-        iterations = 1
-        while (elapsed := timed(run, iterations)) < seconds / 4:
-            iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
-        counts.append(max(1, round(iterations * seconds / elapsed)))
-    rates = [[count / timed(run, count) for run, count in zip(runs, counts, strict=True)] for _ in range(repeats)]
-    return list(zip(map(statistics.median, zip(*rates, strict=True)), compile_seconds, strict=True))
+    operations: float = 0.0  # floating-point, of one unit; 0: not counted
 
 
 def member_keys(members: int) -> Array:
@@ -178,7 +156,9 @@ def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
     keys = member_keys(members)
     state, batch = jax.jit(jax.vmap(agent.init, out_axes=axes))(keys), jax.vmap(random_batch)(keys)
     rate, compile_seconds = measure(lambda steps: run(state, batch, keys, steps), **timing)
-    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds)
+    one = jax.eval_shape(random_batch, jax.random.key(0))
+    count = operations.of_update(agent, example, one, config.agent.policy_delay)
+    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds, count)
 
 
 REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}

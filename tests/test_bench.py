@@ -36,7 +36,7 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
     finally:
         jax.config.update("jax_enable_compilation_cache", cached)
     text = capsys.readouterr().out
-    assert text.count("| env | ") == 4 and "| env | ant | 5 | 1,234 | env steps/s | 6.8 |" in text
+    assert text.count("| env | ") == 4 and "| env | ant | 5 | 1,234 | env steps/s | 6.8 |  |  |" in text
     report = json.loads((tmp_path / "bench.json").read_text())
     assert len(report["rows"]) == 4 and report["machine"]["jax"] == jax.__version__
 
