@@ -4,13 +4,22 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint bench clean
+.PHONY: help run miniature test test-all lint bench clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 run: $(STAMP)  ## SAC with SQT on Ant, five seeds, on a small budget: about three minutes on two cores
 	$(BIN)/python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4 --preset=quick
+
+MINI := runs/miniature
+SMALL := --steps=3000 --warmup_steps=1000 --batch_size=128 --eval_every=1000 --eval_episodes=1 --physics=mujoco
+miniature: $(STAMP)  ## the paper's tables 2 to 4 in small: nine algorithms, two tasks, three seeds; report and film
+	$(BIN)/python -m experiments.sweep --preset=all --tasks=cheetah,ant --seeds=0,1,2 $(SMALL) --out=$(MINI)
+	$(BIN)/python -m experiments.tables $(MINI) --reference --out=$(MINI)/tables --overwrite
+	$(BIN)/python -m experiments.plots $(MINI) --out=$(MINI)/figures --overwrite
+	$(BIN)/python -m experiments.report $(MINI) --reference --out=$(MINI)/report.html --overwrite
+	$(BIN)/python -m experiments.play $(MINI)/cheetah/td7_sqt/*/ --video=$(MINI)/td7_sqt.mp4 --overwrite
 
 test: $(STAMP)  ## all tests but the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"

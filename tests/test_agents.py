@@ -3,6 +3,7 @@
 from functools import cache, partial
 from typing import NamedTuple
 
+import algorithm_rows
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -309,13 +310,14 @@ def test_a_sampled_actor_acts_by_its_mode_and_learns_from_its_samples():
     assert subject("td3").agent.draw_noise(KEY, batch).action_eps is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "n"),
     [
         ("td3_sqt", 3),
-        pytest.param("redq_sqt", 10, marks=pytest.mark.slow),
-        pytest.param("sac_sqt_tuple", 2, marks=pytest.mark.slow),
-        pytest.param("maxmin_sqt", 4, marks=pytest.mark.slow),
+        ("redq_sqt", 10),
+        ("sac_sqt_tuple", 2),
+        ("maxmin_sqt", 4),
     ],
 )
 def test_with_sale_networks_updates_are_finite_and_coefficient_0_is_the_plain_algorithm(algo, n):
@@ -430,7 +432,7 @@ def over_members(function, axes, *states):
     return jax.tree.map(function, axes, *states, is_leaf=lambda axis: axis is None)
 
 
-@every_kind
+@algorithm_rows.every(KINDS, fast=ONE_OF_EACH)
 def test_members_side_by_side_are_each_member_alone(algo):
     agent, update = subject(algo).agent, subject(algo).update
     default = subject(algo).config.scalars()
