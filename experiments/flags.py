@@ -12,11 +12,11 @@ import re
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
-import yaml
 from absl import flags as absl_flags
 
+from experiments import config_file
 from experiments.presets import PRESETS
 from sqt_jax.config import SALE_SETTINGS, TD7_SETTINGS, AgentConfig, Config, ConfigError, TrainConfig, check_value
 from sqt_jax.names import nearest
@@ -25,7 +25,6 @@ from sqt_jax.types import Scalars
 EXAMPLE = "python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4"
 DEFAULT_SEEDS = (0, 1, 2, 3, 4)
 MAX_SEED = 2**32 - 1
-MAX_CONFIG_BYTES = 100_000
 MAX_MEMBERS = 10_000
 # What absl understands beside the flags that are defined: another file of flags, and flags that may be unknown.
 ABSL_FLAGS = ("flagfile", "undefok")
@@ -111,13 +110,6 @@ class Options(NamedTuple):
 
 class UsageError(ValueError):
     """A command line that cannot be. The text is one line that names the flag."""
-
-
-class _Loader(yaml.SafeLoader):
-    """Plain YAML without merge keys (`<<`): a few lines of them can ask for more memory than there is."""
-
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        pass
 
 
 class _Flag(NamedTuple):
@@ -299,37 +291,10 @@ def _with_resume_valued(argv: Sequence[str]) -> list[str]:
 
 def _file_values(name: str) -> dict[str, Any]:
     """The flags of a YAML file, parsed as those of a command line."""
-
-    def refuse(message: str) -> NoReturn:
-        raise UsageError(f"--config={name}: {message}")
-
-    path = Path(name)
     try:
-        if not path.is_file():
-            refuse("takes a file, which this is not" if path.exists() else "there is no such file")
-        with path.open("rb") as file:
-            text = file.read(MAX_CONFIG_BYTES + 1)
-        if len(text) > MAX_CONFIG_BYTES:
-            refuse(f"takes a file of at most {MAX_CONFIG_BYTES} bytes")
-        content = yaml.load(text.decode("utf-8"), _Loader)
-    except UsageError:
-        raise
-    except OSError as error:
-        refuse(f"cannot be read: {error.strerror}")
-    # Beside its own errors, PyYAML lets pass what Python says of a date, a number or a tag that cannot be.
-    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError):
-        refuse("takes a YAML file, which this is not")
-    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        refuse("takes lines like `steps: 100000`")
-    arguments = []
-    for key, value in content.items():
-        if key in ("config", "help", "resume"):
-            refuse(f"{key} is for the command line")
-        items = value if isinstance(value, list) else [value]
-        if not items or not all(isinstance(item, bool | int | float | str) for item in items):
-            refuse(f"{key} takes a number, a word or a list of them")
-        words = [str(item).lower() if isinstance(item, bool) else str(item) for item in items]
-        arguments.append(f"--{key}={','.join(words)}")
+        arguments = config_file.arguments(Path(name))
+    except config_file.Refused as error:
+        raise UsageError(f"--config={name}: {error}") from None
     try:
         return _values(["", *arguments])
     except UsageError as error:

@@ -165,6 +165,7 @@ DEEP = "\n".join(["a: &a [x]", *(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a
 MERGED = DEEP.replace("[x]", "{x: 1}").replace("[*", "{<<: [*").replace("]", "]}")
 FILES = {
     "truncated": ("steps: [5", "takes a YAML file"),
+    "twice": ("steps: 5\nseeds: 1\nsteps: 6", "takes each setting once, not steps 2 times"),
     "list": ("- steps", "takes lines like"),
     "word": ("steps", "takes lines like"),
     "nothing": ("", "takes lines like"),

@@ -1,0 +1,44 @@
+"""A file of settings is the command line that it stands for, or is refused (hostile files: test_bad_input.py)."""
+
+import pytest
+
+from experiments import config_file
+
+
+def test_lines_are_arguments(tmp_path):
+    path = tmp_path / "flags.yaml"
+    path.write_text(
+        "algo: td3_sqt\nsteps: 1e5  # a comment\nseeds: [0, 1]\ntensorboard: true\nlr: 0.1\nhidden: [64, 64]\n"
+    )
+    assert config_file.arguments(path) == [
+        "--algo=td3_sqt",
+        "--steps=1e5",
+        "--seeds=0,1",
+        "--tensorboard=true",
+        "--lr=0.1",
+        "--hidden=64,64",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steps: 1\nsteps: 2", "takes each setting once, not steps 2 times"),
+        ("steps: {a: 1, a: 2}", "takes each setting once, not a 2 times"),
+        ("config: other.yaml", "config is for the command line"),
+        ("steps: []", "steps takes a number, a word or a list of them"),
+        ("steps", "takes lines like `steps: 100000`"),
+    ],
+)
+def test_others_are_refused(tmp_path, text, message):
+    path = tmp_path / "flags.yaml"
+    path.write_text(text)
+    with pytest.raises(config_file.Refused) as error:
+        config_file.arguments(path)
+    assert str(error.value) == message
+
+
+def test_no_file(tmp_path):
+    for path, message in ((tmp_path / "none", "there is no such file"), (tmp_path, "takes a file, which this is not")):
+        with pytest.raises(config_file.Refused, match=message):
+            config_file.arguments(path)
