@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -9,24 +10,27 @@ import pytest
 from experiments import flags, play, plots, report, run, tables
 from experiments.plan import make_plan
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```(\w+)( continued)?\n(.*?)```", README, re.DOTALL)
 PYTHON = [code for language, continued, code in BLOCKS if language == "python" and not continued]
-COMMANDS = [
-    shlex.split(line, comments=True)[2:]
-    for language, _, code in BLOCKS
-    if language == "sh"
-    for line in code.splitlines()
-    if " -m experiments.run " in line
-]
+SHELL = "\n".join(code for language, _, code in BLOCKS if language == "sh")
 
-LOOKS = [
-    shlex.split(line, comments=True)[2:]
-    for language, _, code in BLOCKS
-    if language == "sh"
-    for line in code.splitlines()
-    if re.search(r" -m experiments\.(tables|plots|report|play) ", line)
-]
+
+def commands(text, *modules):
+    """The command lines in a text that start one of these modules, from the module's name on."""
+    pattern = rf" -m experiments\.({'|'.join(modules)}) "
+    return [shlex.split(line, comments=True)[2:] for line in text.splitlines() if re.search(pattern, line)]
+
+
+COMMANDS = commands(SHELL, "run")
+LOOKS = commands(SHELL, "tables", "plots", "report", "play")
+
+
+def understood(argv):
+    """The options of a command that looks at runs."""
+    modules = (tables, plots, report, play)
+    return {module.__name__: module for module in modules}[argv[0]].parser().read(argv)
 
 
 @pytest.mark.parametrize("code", PYTHON, ids=lambda code: code.splitlines()[0])
@@ -45,9 +49,17 @@ def test_commands_are_understood(argv, tmp_path):
 
 @pytest.mark.parametrize("argv", LOOKS, ids=lambda argv: " ".join(argv))
 def test_commands_that_look_at_runs_are_understood(argv):
-    modules = (tables, plots, report, play)
-    commands = {module.__name__: module for module in modules}
-    assert commands[argv[0]].parser().read(argv).runs
+    assert understood(argv).runs
+
+
+def test_the_miniatures_commands_are_understood():
+    made = subprocess.run(["make", "--dry-run", "miniature"], cwd=ROOT, capture_output=True, text=True, check=True)
+    ((_, *sweep),) = commands(made.stdout, "sweep")
+    rest = [word for word in sweep if not word.startswith(("--preset=", "--tasks="))]
+    options = flags.parse(["run", "--algo=td3", "--env=ant", *rest])
+    assert (options.settings["steps"], options.settings["physics"]) == (3_000, "mujoco")
+    looks = commands(made.stdout, "tables", "plots", "report", "play")
+    assert len(looks) == 4 and all(understood(argv).runs for argv in looks)
 
 
 def test_the_readme_has_them():
