@@ -5,7 +5,7 @@ does (activations, Adam) is a few per cent of them, and is limited by memory, no
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -64,5 +64,4 @@ def _rate(shape: tuple[int, int, int], **timing: Any) -> float:
     def run(x: jax.Array, kernel: jax.Array, times: int) -> jax.Array:
         return jax.lax.fori_loop(0, times, lambda _, x: x @ kernel, x)
 
-    once: Callable[[int], Any] = lambda times: run(x, kernel, times)  # noqa: E731
-    return 2 * count * rows * width * width * measure(once, **timing)[0]
+    return 2 * count * rows * width * width * measure(lambda times: run(x, kernel, times), **timing)[0]
