@@ -1,5 +1,7 @@
 """Throughput of each part: `python -m experiments.bench --suites=env,update,loop --members=1,5`.
 
+`--compare=sbx` adds another project's whole loop on the same machine, in turns with ours (`experiments.compare`).
+
 Operations are those of the matrix products, and their peak is measured in the same run (`operations`).
 Each figure is the median over `--repeats` timed calls of a compiled loop that runs for about `--seconds`, after a
 first call that compiles. The suites of one process run one after the other; compare figures of one run only, since a
@@ -9,9 +11,10 @@ machine's speed changes with what else it does.
 import dataclasses
 import itertools
 import json
+import os
 import platform
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,7 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import operations, runtime
+from experiments import compare, operations, runtime
 from experiments.measure import (
     REPLAYS,
     Row,
@@ -42,7 +45,10 @@ flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itsel
 flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
+flags.DEFINE_list("devices", ["1"], "Numbers of devices that the suite loop spreads its members over.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
+flags.DEFINE_list("compare", [], f"Peers to measure beside ours, in turns: {', '.join(compare.NEEDS)}.")
+flags.DEFINE_string("peer_python", sys.executable, "The Python that has the peers' packages.")
 flags.DEFINE_integer("repeats", 5, "Timed calls per figure; the median counts.", lower_bound=1)
 flags.DEFINE_float("seconds", 1.0, "About how long one timed call runs.", lower_bound=0.0)
 flags.DEFINE_string("json", "", "Also write the rows to this file.")
@@ -50,16 +56,25 @@ flags.DEFINE_string("json", "", "Also write the rows to this file.")
 
 def check_flags() -> None:
     """Leaves with one line that names the first flag with a value that cannot be."""
-    known = {"suites": SUITES, "tasks": envs.TASKS, "algos": algorithms.ALGORITHMS, "physics": envs.PHYSICS}
+    known = {
+        "suites": SUITES,
+        "compare": compare.NEEDS,
+        "tasks": envs.TASKS,
+        "algos": algorithms.ALGORITHMS,
+        "physics": envs.PHYSICS,
+    }
     for name, values in known.items():
         for value in getattr(FLAGS, name) or ():
             if value not in values:
                 sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
-    for name in ("members", "capacities"):
+    for name in ("members", "devices", "capacities"):
         for value in getattr(FLAGS, name):
             if not value.isdecimal() or int(value) < 1:
                 sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
     solver_limits()
+    for peer in FLAGS.compare:
+        if compare.lacks(peer, FLAGS.peer_python):
+            sys.exit(f"--compare: {peer} needs a Python with {compare.INSTALL[peer]}; --peer_python names it")
 
 
 def solver_limits() -> dict[str, dict[str, int]]:
@@ -81,7 +96,8 @@ def physics_here() -> list[str]:
     return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
 
 
-def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterator[Row]:
+def rows(suites: Sequence[str], physics: Sequence[str], environment: Mapping[str, str], **timing: Any) -> Iterator[Row]:
+    """What the flags ask for; `environment` is that of the peers' processes."""
     tasks, algos = FLAGS.tasks, FLAGS.algos
     members = [int(value) for value in FLAGS.members]
     for suite in suites:
@@ -105,7 +121,11 @@ def rows(suites: Sequence[str], physics: Sequence[str], **timing: Any) -> Iterat
                     yield from bench_checkpoint(algo, task, count, timing["repeats"])
             elif suite == "loop":
                 for algo, task in itertools.product(algos, tasks):
-                    yield from bench_loops(algo, task, count, physics, **timing)
+                    devices = [int(value) for value in FLAGS.devices]
+                    yield from bench_loops(algo, task, count, physics, devices, **timing)
+    for peer, count, algo, task in itertools.product(FLAGS.compare, members, algos, tasks):
+        if algo in compare.ALGORITHMS[peer]:
+            yield from compare.compare(peer, algo, task, count, physics, FLAGS.peer_python, environment, **timing)
 
 
 def machine() -> dict[str, Any]:
@@ -158,12 +178,15 @@ def main(argv: Sequence[str]) -> None:
     del argv
     check_flags()
     logging.set_verbosity(logging.WARNING)
+    environment = dict(os.environ)  # before our own options for XLA are in it
     runtime.prepare()
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     console = Console()
     console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
+    if (most := max(map(int, FLAGS.devices))) > (here := len(jax.local_devices())):
+        sys.exit(f"--devices: takes at most {here} here, not {most}")
     found = []
-    for row in rows(FLAGS.suites, physics_here(), seconds=FLAGS.seconds, repeats=FLAGS.repeats):
+    for row in rows(FLAGS.suites, physics_here(), environment, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
         found.append(row)
         console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
     peak = 0.0
@@ -175,7 +198,7 @@ def main(argv: Sequence[str]) -> None:
         table.add_row(*cells(row, peak))
     console.print(table)
     print(markdown(found, peak))
-    print("\n".join(ratios(found)))
+    print("\n".join(ratios(found) + compare.ratios(found)))
     if FLAGS.json:
         report = {"machine": machine(), "peak": peak, "rows": [dataclasses.asdict(row) for row in found]}
         Path(FLAGS.json).write_text(json.dumps(report, indent=1) + "\n")

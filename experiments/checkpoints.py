@@ -19,7 +19,8 @@ import numpy as np
 from experiments import files, manifests
 from experiments.loop import Position
 from experiments.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
-from sqt_jax.train import TrainState
+from sqt_jax.members import Layout
+from sqt_jax.train import TrainState, state_axes
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Array, Replay
 
@@ -40,12 +41,13 @@ class Checkpoints:
     Args:
       path: the folder, which need not exist.
       replay: the run's replay, which says where its state keeps its rows.
+      layout: the run's members and where they lie: on disk are theirs alone, whatever the devices.
       keep: how many checkpoints are kept, the latest ones.
       warn: takes a line on what went wrong; a checkpoint that cannot be written is no reason to stop training.
     """
 
-    def __init__(self, path: Path, replay: Replay, keep: int, warn: Callable[[str], None]):
-        self.path, self.replay, self.keep, self.warn = path, replay, keep, warn
+    def __init__(self, path: Path, replay: Replay, layout: Layout, keep: int, warn: Callable[[str], None]):
+        self.path, self.replay, self.layout, self.keep, self.warn = path, replay, layout, keep, warn
         self._rows: list[Rows] = []  # all that are wanted, in order
         self._rows_end = 0  # env steps that they reach
         self._steps: dict[Step, int] = {}  # checkpoints that are wanted, in order -> the step of their last evaluation
@@ -68,7 +70,9 @@ class Checkpoints:
         except OSError as error:
             self._failed(position.env_steps, error)
             return
-        arrays = {name: _host_copy(leaf) for name, leaf in _held(self._without_rows(state)).items()}
+        rest = self._without_rows(state)
+        own = by_path(state_axes(rest))
+        arrays = {name: self._host_copy(leaf, name in own) for name, leaf in _held(rest).items()}
         arguments = (Step(position.env_steps, len(same)), arrays, storage.shape[1], position, lengths)
         self._writer = threading.Thread(target=self._write, args=arguments, daemon=True)
         self._writer.start()
@@ -85,7 +89,7 @@ class Checkpoints:
         Those that are not whole are named to `warn`. Nothing is removed (`remove_others`).
 
         Args:
-          template: shapes and types of the state, as `jax.eval_shape` gives them.
+          template: shapes and types of a state of the run's members alone, as `jax.eval_shape` gives them.
 
         Raises:
           Refused: none is whole, or one cannot be read or is of another run.
@@ -121,19 +125,19 @@ class Checkpoints:
                 _remove(item)
 
     def sizes(self, template: TrainState) -> tuple[int, int]:
-        """Bytes of a checkpoint without the replay, and of the replay's rows per env step."""
+        """Bytes of a checkpoint without the replay, and of the replay's rows per env step; `template` as above."""
         rest = sum(_on_host(leaf).nbytes for leaf in jax.tree.leaves(self._without_rows(template)))
         members, _, width = self.replay.storage(template.replay).shape
         return rest, 4 * members * width
 
     def _write_rows(self, storage: Array, stop: int) -> None:
-        members, capacity, width = storage.shape
-        piece = max(1, PIECE_BYTES // (4 * members * width))
+        held, capacity, width = storage.shape
+        piece = max(1, PIECE_BYTES // (4 * held * width))
         start = max(self._rows_end, stop - capacity)
         while start < stop:
             in_ring = start % capacity
             count = min(piece, stop - start, capacity - in_ring)
-            rows = np.asarray(_slice(storage, in_ring, count)).data
+            rows = np.asarray(_slice(storage, in_ring, count))[: self.layout.members].data
             file = Rows(start, start + count, zlib.crc32(rows))
             with files.whole_file(self.path / file.name) as out:
                 out.write(rows)
@@ -183,16 +187,26 @@ class Checkpoints:
         except Exception as error:  # whatever Orbax says of a folder that is not its own
             raise Refused(f"Orbax cannot read its checkpoint ({type(error).__name__})") from None
         empty = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in by_path(rest).items() if not leaf.size}
-        leaves = {name: _on_device(arrays[name], leaf) for name, leaf in _held(rest).items()}
+        own = by_path(state_axes(rest))
+        leaves = {name: self._on_devices(arrays[name], leaf, name in own) for name, leaf in _held(rest).items()}
         state = from_paths(rest, leaves | empty)
         if int(state.env_steps) != step.env_steps:
             raise Refused(f"its checkpoint at step {step.env_steps:,} is of step {int(state.env_steps):,}")
         shape = self.replay.storage(template.replay).shape
-        storage = jnp.zeros(shape, jnp.float32)
+        storage = jnp.zeros((self.layout.held, *shape[1:]), jnp.float32, device=self.layout.sharding(0))
         for file in manifest.rows:
             values = np.fromfile(self.path / file.name, np.float32).reshape(shape[0], -1, shape[2])
-            storage = _write_slice(storage, values, file.start % shape[1])
+            storage = _write_slice(storage, self.layout.filled(values), file.start % shape[1])
         return state._replace(replay=self.replay.with_storage(state.replay, storage))
+
+    def _host_copy(self, leaf: Array, own: bool) -> np.ndarray:
+        array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+        # A copy: training goes on in the same memory while it is written.
+        return np.array(array[: self.layout.members] if own else array)
+
+    def _on_devices(self, array: np.ndarray, like: Any, own: bool) -> Array:
+        there = jax.device_put(self.layout.filled(array) if own else array, self.layout.sharding(0 if own else None))
+        return jax.random.wrap_key_data(there) if _is_key(like) else there
 
     def _without_rows(self, state: TrainState) -> TrainState:
         return state._replace(replay=self.replay.with_storage(state.replay, None))  # type: ignore[arg-type]
@@ -225,18 +239,9 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _host_copy(leaf: Array) -> np.ndarray:
-    # A copy: training goes on in the same memory while it is written.
-    return np.array(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-
-
 def _on_host(leaf: Any) -> np.ndarray:
     shape = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
     return np.zeros(shape.shape, shape.dtype)
-
-
-def _on_device(array: np.ndarray, like: Any) -> Array:
-    return jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(like) else jnp.asarray(array)
 
 
 def _slice(storage: Array, start: int, count: int) -> Array:

@@ -29,7 +29,7 @@ MAX_MEMBERS = 10_000
 # What absl understands beside the flags that are defined: another file of flags, and flags that may be unknown.
 ABSL_FLAGS = ("flagfile", "undefok")
 # The run's own flags that a resumed run takes over; the smallest value of each.
-OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "tensorboard": False}
+OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "devices": 1, "tensorboard": False}
 CHECKPOINT_EVERY = 25_000
 LATEST = "\n"  # no folder's name on a command line
 KEEP_CHECKPOINTS = 2
@@ -104,6 +104,7 @@ class Options(NamedTuple):
     overwrite: bool
     checkpoint_every: int | None
     keep_checkpoints: int | None
+    devices: int | None
     tensorboard: bool | None
     quiet: bool
 
@@ -227,6 +228,13 @@ FLAGS: dict[str, list[_Flag]] = {
             str(CHECKPOINT_EVERY),
         ),
         _Flag("keep_checkpoints", _integer, "a whole number", "how many are kept", str(KEEP_CHECKPOINTS)),
+        _Flag(
+            "devices",
+            _integer,
+            "a whole number",
+            "devices (accelerators, or cores of a CPU) that the members are spread over",
+            "all accelerators; on a CPU as many cores as share the members evenly",
+        ),
         _Flag("tensorboard", None, "true or false", "also write TensorBoard events", "true"),
         _Flag("quiet", None, "true or false", "print errors only", "false"),
         _Flag("help", None, "true or false", "this text", ""),

@@ -120,7 +120,8 @@ def train_loop(
 
     Advances in chunks that end at evaluations, checkpoints and the end of the warm-up. `save` is called every
     `checkpoint_every` environment steps and at the end (0: never), after an evaluation's report. `stop` is asked
-    between chunks; once it says True, the state is saved, what there is is reported and the loop returns.
+    between chunks; once it says True, the state is saved, what there is is reported and the loop returns. Of a state
+    with more than `num_members`, the first ones count (`sqt_jax.members`).
     """
     began = clock() - start.wall_seconds
     pace = Pace()
@@ -128,6 +129,9 @@ def train_loop(
     done, evaluated, reported = start.env_steps, start.evaluated, max(start.evaluated, 0)
     interrupted = False
     last_return: float | None = None
+
+    def of_members(leaf: jax.Array) -> np.ndarray:
+        return np.asarray(leaf)[:num_members]
 
     def show(phase: str, learn: bool) -> None:
         rate = pace.rates[learn] * train.num_envs * num_members if learn in pace.rates else None
@@ -138,20 +142,20 @@ def train_loop(
         show("evaluating" if pace.evaluations else "compiling the evaluation", done >= train.warmup_steps)
         before = clock()
         evaluation, bias = sweep.evaluate(state)
-        returns, lengths = np.asarray(evaluation.returns), np.asarray(evaluation.lengths)
+        returns, lengths = of_members(evaluation.returns), of_members(evaluation.lengths)
         pace.evaluated(clock() - before)
         bad = find_diverged(returns)
         # The return of the policy that a diverged member is frozen at is not what its algorithm reaches at this step.
         returns = np.where(bad[:, None], np.nan, returns)
         if not bad.all():
             last_return = float(np.nanmean(returns))
-        send(returns, lengths, {name: np.where(bad, np.nan, value) for name, value in bias.items()})
+        send(returns, lengths, {name: np.where(bad, np.nan, of_members(value)) for name, value in bias.items()})
         evaluated = done
         display.evaluated(done, returns[~bad].mean(axis=1))
 
     def find_diverged(returns: np.ndarray | None) -> np.ndarray:
         """[S] bool; members that were not known to be are announced."""
-        since = np.asarray(state.diverged_at)
+        since = of_members(state.diverged_at)
         if returns is not None:  # an environment whose rewards are not finite
             since = np.where((since < 0) & ~np.isfinite(returns).all(axis=1), done, since)
         for member in (int(index) for index in np.flatnonzero(since >= 0)):
@@ -163,7 +167,7 @@ def train_loop(
 
     def send(returns: np.ndarray | None, lengths: np.ndarray | None, bias: dict[str, np.ndarray]) -> None:
         """What the state tells of the interval; nothing before the first step."""
-        metrics = {name: np.asarray(value) for name, value in sweep.measure(state).items()} if done else {}
+        metrics = {name: of_members(value) for name, value in sweep.measure(state).items()} if done else {}
         report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths, bias))
 
     def save_here() -> None:

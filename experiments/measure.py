@@ -16,8 +16,9 @@ from mujoco import rollout as rollout_c
 from experiments import operations
 from experiments.timing import measure, measure_in_turns
 from sqt_jax import algorithms, envs, lap, replay, rollout, train
+from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
-from sqt_jax.envs.physics import mujoco_c
+from sqt_jax.members import Layout, member_axes
 from sqt_jax.types import Array, Transition
 
 BATCH = 256
@@ -75,7 +76,7 @@ def bare_steps(task: str, members: int) -> Callable[[int], None]:
     """
     row = gym_table.TASKS[task]
     model = gym_tasks.load_model(row)
-    threads = mujoco_c.usable_cores()
+    threads = usable_cores()
     data = [mujoco.MjData(model) for _ in range(max(members, threads))]
     generator = np.random.default_rng(0)
     low, high = model.actuator_ctrlrange.T
@@ -126,7 +127,14 @@ def bench_physics(task: str, members: int, solver: Mapping[str, dict[str, int]],
 
 def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
     """Updates on one fixed batch: the learner alone, without environment and replay."""
-    config = algorithms.make_config(algo, task)
+    run, count = updates(algo, task, members)
+    rate, compile_seconds = measure(run, **timing)
+    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds, count)
+
+
+def updates(algo: str, task: str, members: int, **settings: Any) -> tuple[Callable[[int], Any], float]:
+    """A number of updates -> the state after them; and the floating-point operations of one member's update."""
+    config = algorithms.make_config(algo, task, **settings)
     env = envs.make(task)
     agent = algorithms.agent_of(config, env)
     size = config.train.batch_size
@@ -143,7 +151,7 @@ def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
         return Transition(obs, jnp.tanh(action), reward, next_obs, jnp.ones(size))
 
     example = jax.eval_shape(agent.init, jax.random.key(0))
-    axes = train.member_axes(example)
+    axes = member_axes(example)
     update = jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0))
 
     @jax.jit
@@ -155,10 +163,9 @@ def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
 
     keys = member_keys(members)
     state, batch = jax.jit(jax.vmap(agent.init, out_axes=axes))(keys), jax.vmap(random_batch)(keys)
-    rate, compile_seconds = measure(lambda steps: run(state, batch, keys, steps), **timing)
     one = jax.eval_shape(random_batch, jax.random.key(0))
     count = operations.of_update(agent, example, one, config.agent.policy_delay)
-    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds, count)
+    return lambda steps: run(state, batch, keys, steps), count
 
 
 REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}
@@ -168,7 +175,7 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
     """One insert of a row, or one sampled batch and what it feeds back, on a full buffer."""
     env = envs.make(task)
     store = REPLAYS[kind](capacity, BATCH, env.observation_size, env.action_size)
-    axes = train.member_axes(jax.eval_shape(store.init))
+    axes = member_axes(jax.eval_shape(store.init))
     obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
 
     def insert(state, total, key, step):
@@ -202,18 +209,29 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
     return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
 
 
-def bench_loops(algo: str, task: str, members: int, physics: Sequence[str], **timing: Any) -> Iterator[Row]:
-    """The whole training loop, on each physics in turn: environment step, insert, sample, update."""
-    runs, compile_seconds = zip(*(loop_steps(algo, task, members, name) for name in physics), strict=True)
+def bench_loops(
+    algo: str, task: str, members: int, physics: Sequence[str], devices: Sequence[int], **timing: Any
+) -> Iterator[Row]:
+    """The whole training loop, on each physics and number of devices in turn: environment, insert, sample, update."""
+    cases = {
+        f"{name}, {count} devices" if count > 1 else name: (name, count)
+        for name in physics
+        for count in devices
+        if count <= members
+    }
+    runs, compile_seconds = zip(*(loop_steps(algo, task, members, *case) for case in cases.values()), strict=True)
     rates = measure_in_turns(runs, **timing)
-    for name, (rate, _), seconds in zip(physics, rates, compile_seconds, strict=True):
+    for name, (rate, _), seconds in zip(cases, rates, compile_seconds, strict=True):
         yield Row("loop", f"{algo} on {task}, {name}", members, "env steps", rate * members, seconds)
 
 
-def loop_steps(algo: str, task: str, members: int, physics: str) -> tuple[Callable[[int], Any], float]:
+def loop_steps(
+    algo: str, task: str, members: int, physics: str, devices: int = 1
+) -> tuple[Callable[[int], Any], float]:
     """A number of lockstep steps of training -> what it waits for; and the seconds of compilation."""
     config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
-    sweep = train.make_sweep(algorithms.make_trainer(config))
+    layout = Layout(members, tuple(jax.local_devices()[:devices]))
+    sweep = train.make_sweep(algorithms.make_trainer(config), layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
     start = time.perf_counter()

@@ -13,6 +13,7 @@ from experiments.checkpoints import Checkpoints
 from experiments.loop import Position
 from experiments.measure import Row, member_keys
 from sqt_jax import algorithms, envs, train
+from sqt_jax.members import Layout
 
 FILLED = 100_000  # rows of the replay
 SINCE = 25_000  # of them those that came since the last checkpoint: the default interval
@@ -31,13 +32,13 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     everything, later, waits, size = [], [], [], 0
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
-            store = Checkpoints(Path(folder), replay, 2, print)
+            store = Checkpoints(Path(folder), replay, Layout(members), 2, print)
             save(store, state, FILLED - SINCE)
             waiting, whole = save(store, state, FILLED)
             waits.append(waiting)
             later.append(whole)
         with tempfile.TemporaryDirectory() as folder:
-            everything.append(save(Checkpoints(Path(folder), replay, 2, print), state, FILLED)[1])
+            everything.append(save(Checkpoints(Path(folder), replay, Layout(members), 2, print), state, FILLED)[1])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
     def row(what: str, seconds: list[float]) -> Row:

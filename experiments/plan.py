@@ -15,6 +15,7 @@ from experiments.presets import preset_settings
 from sqt_jax import envs
 from sqt_jax.algorithms import check_physics, make_config, memory_estimate
 from sqt_jax.config import Config, ConfigError, TrainConfig
+from sqt_jax.members import Layout, usable_devices
 from sqt_jax.types import Environment
 
 
@@ -26,6 +27,7 @@ class Plan(NamedTuple):
     path: Path
     resumed: Described | None  # the run to go on with; None is a new one
     output: dict[str, Any]  # the values of `flags.OUTPUT`
+    layout: Layout
     env: Environment
     own_env: Environment | None  # which takes the place of the named one
     options: flags.Options
@@ -62,13 +64,15 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         env = own_env or envs.make(config.env, config.physics)
     except ValueError as error:
         raise flags.UsageError(f"--physics: {error}") from None
-    needed, free = memory_estimate(config, len(members), env), _free_memory()
+    output = _output(options, run, config.train)
+    layout = _layout(len(members), output)
+    needed, free = memory_estimate(config, layout.held, env), _free_memory(len(layout.devices))
     if needed > free:
         raise flags.UsageError(
             f"--replay_capacity={config.train.replay_capacity}: {len(members)} members need about "
             f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; takes a smaller number, or fewer --seeds"
         )
-    return Plan(members, swept, path, run, _output(options, run, config.train), env, own_env, options)
+    return Plan(members, swept, path, run, output, layout, env, own_env, options)
 
 
 def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Described | None]:
@@ -121,7 +125,7 @@ def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Des
 def _output(options: flags.Options, run: Described | None, train: TrainConfig) -> dict[str, Any]:
     """The run's own flags: as given, as the resumed run has them, or the defaults."""
     defaults = {"checkpoint_every": flags.CHECKPOINT_EVERY, "keep_checkpoints": flags.KEEP_CHECKPOINTS}
-    output = {"tensorboard": True} | defaults
+    output: dict[str, Any] = {"tensorboard": True, "devices": None} | defaults
     if run:
         kept = {name: run.content["output"].get(name) for name in output}
         output |= {name: value for name, value in kept.items() if _may_be(name, value)}
@@ -133,6 +137,17 @@ def _output(options: flags.Options, run: Described | None, train: TrainConfig) -
             f"--checkpoint_every: takes a multiple of num_envs ({train.num_envs}), not {options.checkpoint_every}"
         )
     return output
+
+
+def _layout(num_members: int, output: dict[str, Any]) -> Layout:
+    """Where the members lie, by --devices, which becomes the number of devices where it was not given."""
+    here = jax.local_devices()
+    count = output["devices"] = output["devices"] or usable_devices(num_members)
+    if count > len(here):
+        raise flags.UsageError(f"--devices={count}: takes at most {len(here)} here")
+    if count > num_members:
+        raise flags.UsageError(f"--devices={count}: takes at most one for each of {num_members} members")
+    return Layout(num_members, tuple(here[:count]))
 
 
 def _default_name(options: flags.Options) -> str:
@@ -162,11 +177,11 @@ def taken(path: Path) -> str:
     return f"--name={path.name}: {path} already holds a run; takes another name, or --overwrite replaces it"
 
 
-def _free_memory() -> int:
-    """Bytes that a run may take: the accelerator's, or the machine's or its container's that are free."""
+def _free_memory(devices: int) -> int:
+    """Bytes that a run may take: the accelerators', or the machine's or its container's that are free."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+        return devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))
     free = psutil.virtual_memory().available
     try:
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()

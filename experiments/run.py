@@ -46,10 +46,11 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
         _lock(plan, stack)
         display = stack.enter_context(progress.Display(console, plan.train.steps, quiet=plan.options.quiet))
         stop = stack.enter_context(_stop_on_signal())
-        sweep = make_sweep(make_trainer(plan.config, plan.own_env))
-        template = jax.eval_shape(sweep.init, *_start(plan))
+        trainer = make_trainer(plan.config, plan.own_env)
+        sweep = make_sweep(trainer, plan.layout)
+        template = jax.eval_shape(make_sweep(trainer).init, *_start(plan))
         folder, replay = plan.path / "checkpoint", replay_of(plan.config, plan.env)
-        store = checkpoints.Checkpoints(folder, replay, plan.output["keep_checkpoints"], display.message)
+        store = checkpoints.Checkpoints(folder, replay, plan.layout, plan.output["keep_checkpoints"], display.message)
         stack.callback(store.wait)
         restored = _restored(plan, store, template)
         # A new folder is a run, which can be gone on with, before it is anything else; an old one stays as it is until
@@ -191,7 +192,8 @@ def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes
         console.print(text, soft_wrap=True, highlight=False, markup=False)
 
     train = plan.train
-    say(f"{plan.config.algo} on {plan.config.env}, members: {len(plan.members)} -> {plan.path}")
+    devices = f", devices: {len(plan.layout.devices)}" if plan.layout.spread else ""
+    say(f"{plan.config.algo} on {plan.config.env}, members: {len(plan.members)}{devices} -> {plan.path}")
     if plan.resumed:
         at = f"at step {restored.position.env_steps:,}" if restored else "from the start: it has no whole checkpoint"
         say(f"going on with it {at}")
@@ -248,7 +250,7 @@ def _results(plan: "Plan", outcome: Outcome) -> bool:
 
     policy, part = plan.path / "policy", plan.path / "policy.part"
     shutil.rmtree(part, ignore_errors=True)
-    save_policy(part, plan.config, plan.env, outcome.state.agent)
+    save_policy(part, plan.config, plan.env, outcome.state.agent, len(plan.members))
     shutil.rmtree(policy, ignore_errors=True)  # of the process that this one continues
     part.rename(policy)
     table = records.read_evaluations(plan.path / "evaluations.csv")

@@ -1,7 +1,10 @@
-"""What a process sets before JAX starts: the cache of compiled programs, and one XLA option."""
+"""What a process sets before JAX starts: the cache of compiled programs, one XLA option, a device for each core."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
+
+from sqt_jax.cores import usable_cores
 
 # XLA's CPU backend compiles loops over little data into one function each. Its own limit leaves MJX's solver loops out,
 # whose many small kernels are then dispatched one by one.
@@ -24,6 +27,8 @@ def prepare() -> None:
 
     import jax
 
+    with suppress(RuntimeError):  # JAX has started already, with the devices that it has
+        jax.config.update("jax_num_cpu_devices", usable_cores())
     jax.config.update("jax_compilation_cache_dir", str(cache_directory()))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -27,8 +27,10 @@ MAX_CONFIG_BYTES = 1_000_000
 MAX_SIZE = 1_000_000  # of an observation or an action
 
 
-def save_policy(directory: Path | str, config: Config, env: Environment, agent_state: State) -> None:
-    """Writes the policy of every member of `agent_state` ([S, ...]) to a new directory.
+def save_policy(
+    directory: Path | str, config: Config, env: Environment, agent_state: State, members: int | None = None
+) -> None:
+    """Writes the policies of the first `members` (None: all) of `agent_state` ([S, ...]) to a new directory.
 
     Raises:
       FileExistsError: the directory exists.
@@ -40,7 +42,7 @@ def save_policy(directory: Path | str, config: Config, env: Environment, agent_s
     agent = agent_of(config, env)
     arrays = by_path(jax.device_get(agent.policy(agent_state)))
     (directory / "act.stablehlo").write_bytes(_exported(agent, env.observation_size))
-    for member in range(next(iter(arrays.values())).shape[0]):
+    for member in range(members or next(iter(arrays.values())).shape[0]):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
 
 

@@ -14,11 +14,8 @@ import jax.numpy as jnp
 from sqt_jax import rollout
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation, evaluate_and_judge
+from sqt_jax.members import Layout, member_axes
 from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep
-
-# Leaves that are equal in all members, which advance in lockstep.
-SHARED_LEAVES = frozenset({"env_steps", "gradient_steps", "pointer", "size"})
-
 
 TRAINING, EVALUATION = 0, 1  # what a member's key is folded with, so that the two streams never meet
 
@@ -67,7 +64,10 @@ class Trainer(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """Training of S members in lockstep: the functions of `Trainer` with a leading [S], jit-compiled."""
+    """Training of S members in lockstep: the functions of `Trainer` with a leading [S], jit-compiled.
+
+    On several devices, states and what is told of them may have more than S members (`members.Layout`): theirs first.
+    """
 
     init: Callable[[Array, Scalars], TrainState]  # (keys [S], scalars of [S] each)
     advance: Callable[[TrainState, int, bool], TrainState]  # donates the state
@@ -195,26 +195,30 @@ def make_trainer(
     return Trainer(init, advance, evaluate_policy, measure)
 
 
-def member_axes(state: State) -> Any:
-    """For each leaf of a state: 0 where members have their own, None where they share it."""
-
-    def axis(path, _):
-        name = getattr(path[-1], "name", None)
-        return None if name in SHARED_LEAVES else 0
-
-    return jax.tree_util.tree_map_with_path(axis, state)
-
-
-def make_sweep(trainer: Trainer) -> Sweep:
-    """Compiles a trainer over members; each function compiles once, whatever the number of steps."""
-    example = jax.eval_shape(trainer.init, jax.random.key(0))
+def state_axes(state: TrainState) -> Any:
+    """`member_axes` of a training state."""
     # The environment is its author's: whatever its fields are called, every member has its own.
-    axes = member_axes(example)._replace(timestep=0)
+    return member_axes(state)._replace(timestep=jax.tree.map(lambda _: 0, state.timestep))
+
+
+def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
+    """Compiles a trainer over members; each function compiles once, whatever the number of steps.
+
+    Args:
+      layout: the members and the devices that they are spread over; None is any number of them on the default device.
+    """
+    axes = state_axes(jax.eval_shape(trainer.init, jax.random.key(0)))
+    layout = layout or Layout(1)
+
+    def init(keys: Array, scalars: Scalars) -> TrainState:
+        return on_devices(*jax.tree.map(layout.filled, (keys, scalars)))
+
+    on_devices = layout.over_members(trainer.init, (0, 0), axes)
     return Sweep(
-        init=jax.jit(jax.vmap(trainer.init, out_axes=axes)),
-        advance=jax.jit(jax.vmap(trainer.advance, in_axes=(axes, None, None), out_axes=axes), donate_argnums=0),
-        evaluate=jax.jit(jax.vmap(trainer.evaluate, in_axes=(axes,))),
-        measure=jax.jit(jax.vmap(trainer.measure, in_axes=(axes,))),
+        init=jax.jit(init),
+        advance=jax.jit(layout.over_members(trainer.advance, (axes, None, None), axes), donate_argnums=0),
+        evaluate=jax.jit(layout.over_members(trainer.evaluate, (axes,), 0)),
+        measure=jax.jit(layout.over_members(trainer.measure, (axes,), 0)),
     )
 
 

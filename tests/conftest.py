@@ -17,6 +17,8 @@ import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+jax.config.update("jax_num_cpu_devices", 2)  # sweeps are tested over two devices too
+
 # No deadline: the first example of a property compiles it. Derandomised: a run is repeatable.
 hypothesis.settings.register_profile("sqt_jax", deadline=None, max_examples=40, derandomize=True)
 hypothesis.settings.load_profile("sqt_jax")

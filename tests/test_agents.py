@@ -14,7 +14,7 @@ from sqt_jax import networks
 from sqt_jax.agents import sac, td3, td7
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.config import AgentConfig
-from sqt_jax.train import member_axes
+from sqt_jax.members import member_axes
 from sqt_jax.types import Agent, Scalars, Transition
 
 O, A, B = 3, 2, 16

@@ -26,7 +26,7 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
     found = [
         bench.Row("env", task, members, "env steps", 1234.5, 6.78) for task in ("ant", "walker") for members in (1, 5)
     ]
-    monkeypatch.setattr(bench, "rows", lambda suites, physics, **timing: found)
+    monkeypatch.setattr(bench, "rows", lambda suites, physics, environment, **timing: found)
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
     cached = jax.config.jax_enable_compilation_cache
     try:
@@ -52,6 +52,8 @@ def test_the_table_and_the_file_hold_every_row(monkeypatch, tmp_path, capsys):
         ("solver", "8/0"),
         ("members", "0"),
         ("capacities", "x"),
+        ("devices", "0"),
+        ("compare", "cleanrl"),
     ],
 )
 def test_a_wrong_name_is_told_in_one_line_before_anything_runs(flag, value):
@@ -68,6 +70,30 @@ def test_physics_that_cannot_run_here_are_left_out_or_refused(monkeypatch):
     assert bench.physics_here() == ["mjx", "mujoco"]
     with flagsaver.flagsaver(physics=["warp"]), pytest.raises(SystemExit, match="^--physics: warp needs a part$"):
         bench.physics_here()
+
+
+def test_a_peer_that_is_not_installed_is_told_before_anything_runs(monkeypatch):
+    monkeypatch.setitem(bench.compare.NEEDS, "sbx", "no_such_module")
+    bench.FLAGS.mark_as_parsed()
+    with (
+        flagsaver.flagsaver(compare=["sbx"]),
+        pytest.raises(SystemExit, match="^--compare: sbx needs a Python with sbx"),
+    ):
+        bench.main(["bench"])
+
+
+def test_more_devices_than_there_are_are_refused(monkeypatch):
+    monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
+    cached = jax.config.jax_enable_compilation_cache
+    bench.FLAGS.mark_as_parsed()
+    try:
+        with (
+            flagsaver.flagsaver(devices=["1", "99"]),
+            pytest.raises(SystemExit, match="^--devices: takes at most . here"),
+        ):
+            bench.main(["bench"])
+    finally:
+        jax.config.update("jax_enable_compilation_cache", cached)
 
 
 def test_limits_of_the_solver_are_pairs():

@@ -17,6 +17,7 @@ from experiments.loop import Position
 from experiments.manifests import Refused
 from sqt_jax import train
 from sqt_jax.algorithms import ALGORITHMS, replay_of
+from sqt_jax.members import Layout
 
 SEEDS = (0, 1, 2)
 CAPACITY = 64  # less than the steps: the ring goes round
@@ -26,11 +27,14 @@ LENGTHS = {"evaluations": 10, "metrics": 20}
 class Case:
     """A small sweep, and states of it."""
 
-    def __init__(self, algo="td3_sqt", **settings):
+    def __init__(self, algo="td3_sqt", devices=1, **settings):
         small = {"embedding_size": 16} if ALGORITHMS[algo].assessed else {}
-        self.config, _, self.sweep = make(algo, replay_capacity=CAPACITY, **small, **settings)
+        self.config, trainer, self.sweep = make(algo, replay_capacity=CAPACITY, **small, **settings)
         self.replay = replay_of(self.config, probe_envs.one_step())
         self.template = jax.eval_shape(lambda: start(self.config, self.sweep))
+        self.layout = Layout(len(SEEDS), tuple(jax.local_devices()[:devices]))
+        if devices > 1:
+            self.sweep = train.make_sweep(trainer, self.layout)
 
     def advance(self, state, env_steps, learn):
         return self.sweep.advance(state, env_steps // self.config.train.num_envs, learn)
@@ -41,7 +45,7 @@ class Case:
 
     def store(self, folder, keep=2):
         self.said = []
-        return Checkpoints(folder / "checkpoint", self.replay, keep, self.said.append)
+        return Checkpoints(folder / "checkpoint", self.replay, self.layout, keep, self.said.append)
 
     def saved(self, store, *steps):
         """Saves at these steps of one training; the state at the last of them."""
@@ -288,6 +292,22 @@ def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
     with pytest.raises(Refused, match="its checkpoints hold another training state than this run's"):
         other.store(tmp_path).restore(other.template)
     assert other.said == [] and identical(case.store(tmp_path).restore(case.template).state, case.trained(60))
+
+
+@pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
+def test_members_come_back_on_any_devices_without_the_copies_that_filled_them(case, tmp_path):
+    two = Case(devices=2)
+    state = two.saved(two.store(tmp_path), 50, 90)
+    assert state.replay.storage.shape[0] == 4
+    rows = sum(path.stat().st_size for path in (tmp_path / "checkpoint").glob("rows_*"))
+    assert rows == 90 * len(SEEDS) * state.replay.storage.shape[2] * 4
+    again = two.store(tmp_path).restore(two.template).state
+    assert identical(again, state)
+    assert jax.tree.map(lambda leaf: leaf.sharding.spec, again) == jax.tree.map(lambda leaf: leaf.sharding.spec, state)
+    on_one = case.store(tmp_path).restore(case.template).state
+    own = jax.tree.map(lambda leaf: leaf[:3] if leaf.ndim else leaf, state)
+    assert identical(jax.device_put(own, jax.local_devices()[0]), on_one)
+    assert identical(two.advance(again, 30, True), two.advance(state, 30, True))
 
 
 def test_keys_come_back_as_keys(case, tmp_path):

@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # From the ground up; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
     {"sqt_jax.types", "sqt_jax.names"},
-    {"sqt_jax.rarely", "sqt_jax.trees"},
+    {"sqt_jax.cores", "sqt_jax.members", "sqt_jax.rarely", "sqt_jax.trees"},
     {
         "sqt_jax.config",
         "sqt_jax.q_targets",

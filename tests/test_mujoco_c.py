@@ -204,11 +204,6 @@ def test_a_forked_child_has_threads_of_its_own():
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_cores_are_counted_where_the_system_cannot_tell_which_may_be_used(monkeypatch):
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert mujoco_c.usable_cores() == os.cpu_count()
-
-
 def test_no_threads_are_refused():
     with pytest.raises(ValueError, match="num_threads takes at least 1, not 0"):
         mujoco_c.make(setup_of("ant"), num_threads=0)

@@ -2,11 +2,13 @@
 
 import json
 
+import jax
 import probe_envs
 import pytest
 
 from experiments import described, flags
 from experiments.plan import make_plan
+from sqt_jax.members import usable_devices
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
@@ -109,7 +111,7 @@ def test_a_folder_says_what_run_it_is(tmp_path):
     assert again.members == made.members
 
 
-DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2}
+DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": usable_devices(2)}
 
 
 @pytest.mark.parametrize(
@@ -148,3 +150,10 @@ def test_a_run_that_is_in_the_way_is_refused_unless_it_is_to_be_replaced(tmp_pat
     (path / "mine").write_text("")
     with pytest.raises(flags.UsageError, match="^--overwrite: .* holds other things than a run"):
         plan(tmp_path, "--name=a", "--overwrite")
+
+
+def test_there_is_no_device_without_a_member(tmp_path, monkeypatch):
+    monkeypatch.setattr(jax, "local_devices", lambda: jax.devices() * 4)
+    with pytest.raises(flags.UsageError, match=r"^--devices=3: takes at most one for each of 2 members$"):
+        plan(tmp_path, "--seeds=0,1", "--devices=3", "--name=a")
+    assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 
+import jax
 import probe_envs
 import pytest
 from test_cli import rows_of, run
@@ -33,6 +34,15 @@ def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("whole")
     assert run(out, *MEMBERS) == 0
     return out
+
+
+@pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
+def test_a_run_goes_on_on_another_number_of_devices(tmp_path):
+    assert run(tmp_path, *MEMBERS, "--steps=80", "--devices=2") == 0
+    assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["devices"] == 2
+    assert resume(tmp_path, "--devices=1", "--steps=120") == 0
+    assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["devices"] == 1
+    assert {row["env_steps"] for row in rows_of(path_in(tmp_path) / "evaluations.csv")} >= {"0", "80", "120"}
 
 
 def interrupted(out, monkeypatch, at, by=signal.SIGTERM):

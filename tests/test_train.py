@@ -13,6 +13,7 @@ import pytest
 from sqt_jax import algorithms, train
 from sqt_jax.agents import critic
 from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.members import member_axes
 
 TINY = {
     "steps": 400,
@@ -170,7 +171,7 @@ def test_members_differ_in_parameters_starts_and_noise(td3):
 def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
     config, _, sweep = td3
     alone, together = start(config, sweep, (3,)), start(config, sweep, (0, 1, 2, 3))
-    axes = train.member_axes(together)
+    axes = member_axes(together)
     own = jax.tree.map(
         lambda leaf, axis: leaf if axis is None else leaf[3:], together, axes, is_leaf=lambda x: x is None
     )
@@ -312,7 +313,7 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     state, metrics = advance(sweep, state, 200, True)
     obs = jnp.linspace(-0.4, 0.4, 5)[:, None]
     agent = algorithms.agent_of(config, probe_envs.one_step())
-    axes = train.member_axes(state.agent)
+    axes = member_axes(state.agent)
     act = jax.vmap(lambda s: agent.policy_action(agent.policy(s), obs), in_axes=(axes,))
     np.testing.assert_allclose(np.median(act(state.agent), axis=0), obs, atol=0.1)
     assert np.median(metrics["td_error"]) < 0.1  # targets are rewards, and these the true values

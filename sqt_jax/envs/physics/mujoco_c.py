@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
+from sqt_jax.cores import usable_cores
 from sqt_jax.envs.physics import Physics, PhysicsState, Setup
 from sqt_jax.types import Array
 
@@ -221,11 +222,6 @@ def _threads(num_threads: int) -> _Threads:
         if key not in _pools:
             _pools[key] = _Threads(num_threads)
         return _pools[key]
-
-
-def usable_cores() -> int:
-    """Cores that this process may use (macOS cannot tell: all)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _be_quiet(message: str) -> None:

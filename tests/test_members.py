@@ -1,0 +1,125 @@
+"""Members along devices: how many each holds, and that nothing depends on where they lie."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import one_of_two_processes
+import probe_envs
+import pytest
+
+from sqt_jax import algorithms, members, train
+from sqt_jax.members import Layout
+
+DEVICES = tuple(jax.local_devices()[:2])
+pytestmark = pytest.mark.skipif(len(DEVICES) < 2, reason="one device only")
+
+
+@pytest.mark.parametrize(
+    ("count", "devices", "held"), [(1, 0, 1), (5, 1, 5), (4, 2, 4), (5, 2, 6), (3, 8, 8), (9, 4, 12)]
+)
+def test_shares_are_equal(count, devices, held):
+    layout = Layout(count, (jax.devices()[0],) * devices)
+    assert layout.held == held
+    filled = layout.filled(np.arange(count))
+    assert list(filled) == [index % count for index in range(held)]
+
+
+@pytest.mark.parametrize(
+    ("backend", "here", "count", "used"),
+    [("cpu", 2, 5, 1), ("cpu", 2, 6, 2), ("cpu", 8, 6, 6), ("cpu", 4, 6, 3), ("gpu", 4, 5, 4), ("gpu", 8, 5, 5)],
+)
+def test_a_sweep_takes_all_accelerators_and_the_cores_that_share_it_evenly(monkeypatch, backend, here, count, used):
+    monkeypatch.setattr(jax, "local_devices", lambda: list(range(here)))
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    assert members.usable_devices(count) == used
+
+
+def trained(sweep, config, count):
+    """The actors at the start, and the state after a little training."""
+    start = one_of_two_processes.start(sweep, config, count)
+    first = jax.device_get(start.agent.actor)
+    return first, one_of_two_processes.train_a_little(sweep, start)
+
+
+@pytest.fixture(scope="module", params=["td3_sqt", pytest.param("td7_sqt", marks=pytest.mark.slow)])
+def both(request):
+    """Three members on one device and on two."""
+    small = {"embedding_size": 16} if request.param == "td7_sqt" else {}
+    config = algorithms.make_config(request.param, "cheetah", **one_of_two_processes.SETTINGS | small)
+    trainer = algorithms.make_trainer(config, probe_envs.one_step())
+    sweeps = [train.make_sweep(trainer), train.make_sweep(trainer, Layout(3, DEVICES))]
+    return sweeps, [trained(sweep, config, 3) for sweep in sweeps]
+
+
+def numbers(tree):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+
+
+def test_members_start_on_two_devices_as_on_one_bit_for_bit(both):
+    _, ((one, _), (two, _)) = both
+    for a, b in zip(numbers(one), numbers(two), strict=True):
+        np.testing.assert_array_equal(a, b[:3])
+
+
+def test_members_train_on_two_devices_as_on_one(both):
+    sweeps, ((_, one), (_, two)) = both
+    for a, b in zip(numbers(one), numbers(two), strict=True):
+        np.testing.assert_allclose(a, b[:3] if a.ndim else b, rtol=1e-4, atol=1e-5)
+    assert int(one.env_steps) == int(two.env_steps) == 90
+    assert int(one.agent.gradient_steps) == int(two.agent.gradient_steps) == 50
+    results = [(sweep.evaluate(state), sweep.measure(state)) for sweep, state in zip(sweeps, (one, two), strict=True)]
+    for a, b in zip(*map(numbers, results), strict=True):
+        assert b.shape[0] == 4
+        np.testing.assert_allclose(a, b[:3], rtol=1e-3, atol=1e-4)
+
+
+def test_each_device_holds_its_share_alone(both):
+    _, (_, (_, state)) = both
+    for leaf in jax.tree.leaves((state.agent.actor, state.replay)):
+        if not leaf.ndim:
+            continue  # a counter, which all share
+        assert {shard.device for shard in leaf.addressable_shards} == set(DEVICES)
+        assert [shard.data.shape[0] for shard in leaf.addressable_shards] == [2, 2]
+
+
+def test_one_program_for_all_devices_whatever_the_number_of_steps(both):
+    sweeps, _ = both
+    assert sweeps[1].advance._cache_size() == 1
+
+
+@pytest.mark.slow
+def test_members_train_over_two_processes_as_in_one(tmp_path):
+    """`jax.distributed`: the same calls in each process, over the devices of both."""
+    config = algorithms.make_config("td3_sqt", "cheetah", **one_of_two_processes.SETTINGS)
+    sweep = train.make_sweep(algorithms.make_trainer(config, probe_envs.one_step()))
+    _, state = trained(sweep, config, 3)
+    expected = np.asarray(sweep.evaluate(state)[0].returns)
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    tests = Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)])}
+    started = [
+        subprocess.Popen(
+            [sys.executable, str(tests / "one_of_two_processes.py"), address, str(rank), str(tmp_path / f"{rank}.npy")],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    for process in started:
+        output, _ = process.communicate(timeout=240)
+        assert process.returncode == 0, output
+    for rank in range(2):
+        returns = np.load(tmp_path / f"{rank}.npy")
+        assert returns.shape == (4, 2)
+        np.testing.assert_allclose(returns[:3], expected, rtol=1e-3, atol=1e-4)
