@@ -1,5 +1,6 @@
 """Throughput of each part: `python -m experiments.bench --suites=env,update,loop --members=1,5`.
 
+`--suite=gpu` and `--suite=growth` are such command lines by name: what a GPU is measured by, and how cost grows.
 `--compare=sbx` adds another project's whole loop on the same machine, in turns with ours (`experiments.compare`).
 
 Operations are those of the matrix products, and their peak is measured in the same run (`operations`).
@@ -23,7 +24,7 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compare, operations, runtime
+from experiments import compare, growth, kernels, operations, runtime
 from experiments.measure import (
     REPLAYS,
     Row,
@@ -36,9 +37,22 @@ from experiments.measure import (
 from experiments.measure_checkpoints import bench_checkpoint
 from sqt_jax import algorithms, envs
 
-SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")
+SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # what is measured if nothing is said
+MORE_SUITES = ("growth",)
+# Command lines by name: flags of this program, which those that are given win over.
+NAMED: dict[str, dict[str, Any]] = {
+    "gpu": {
+        "suites": ["loop"],
+        "algos": ["td3", "td7"],
+        "tasks": ["ant", "humanoid"],
+        "members": ["5", "64", "512"],
+        "profile": True,
+    },
+    "growth": {"suites": ["growth"], "tasks": ["cheetah"], "members": ["5"]},
+}
 FLAGS = flags.FLAGS
-flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES)}.")
+flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES + MORE_SUITES)}.")
+flags.DEFINE_enum("suite", None, list(NAMED), "Flags by name, which those that are given win over.")
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
 flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
 flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itself all that can run here.")
@@ -47,6 +61,8 @@ flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites upda
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list("devices", ["1"], "Numbers of devices that the suite loop spreads its members over.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
+flags.DEFINE_boolean("profile", False, "Also count and time what the suite loop runs on the device.")
+flags.DEFINE_string("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list("compare", [], f"Peers to measure beside ours, in turns: {', '.join(compare.NEEDS)}.")
 flags.DEFINE_string("peer_python", sys.executable, "The Python that has the peers' packages.")
 flags.DEFINE_integer("repeats", 5, "Timed calls per figure; the median counts.", lower_bound=1)
@@ -56,8 +72,11 @@ flags.DEFINE_string("json", "", "Also write the rows to this file.")
 
 def check_flags() -> None:
     """Leaves with one line that names the first flag with a value that cannot be."""
+    for name, value in NAMED.get(FLAGS.suite, {}).items():
+        if not FLAGS[name].present:
+            FLAGS[name].value = value
     known = {
-        "suites": SUITES,
+        "suites": SUITES + MORE_SUITES,
         "compare": compare.NEEDS,
         "tasks": envs.TASKS,
         "algos": algorithms.ALGORITHMS,
@@ -122,7 +141,9 @@ def rows(suites: Sequence[str], physics: Sequence[str], environment: Mapping[str
             elif suite == "loop":
                 for algo, task in itertools.product(algos, tasks):
                     devices = [int(value) for value in FLAGS.devices]
-                    yield from bench_loops(algo, task, count, physics, devices, **timing)
+                    yield from bench_loops(algo, task, count, physics, devices, FLAGS.profile, **timing)
+            elif suite == "growth":
+                yield from growth.rows(algos, tasks[0], count, **timing)
     for peer, count, algo, task in itertools.product(FLAGS.compare, members, algos, tasks):
         if algo in compare.ALGORITHMS[peer]:
             yield from compare.compare(peer, algo, task, count, physics, FLAGS.peer_python, environment, **timing)
@@ -189,6 +210,8 @@ def main(argv: Sequence[str]) -> None:
     for row in rows(FLAGS.suites, physics_here(), environment, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
         found.append(row)
         console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
+        if row.kinds:
+            console.print(f"  {kernels.told(row.kinds)}", highlight=False)
     peak = 0.0
     if any(row.operations for row in found):
         peak = operations.peak(seconds=FLAGS.seconds, repeats=FLAGS.repeats)
@@ -199,6 +222,8 @@ def main(argv: Sequence[str]) -> None:
     console.print(table)
     print(markdown(found, peak))
     print("\n".join(ratios(found) + compare.ratios(found)))
+    for path in growth.draw(found, Path(FLAGS.figures)):
+        print(path)
     if FLAGS.json:
         report = {"machine": machine(), "peak": peak, "rows": [dataclasses.asdict(row) for row in found]}
         Path(FLAGS.json).write_text(json.dumps(report, indent=1) + "\n")

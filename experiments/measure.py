@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout as rollout_c
 
-from experiments import operations
+from experiments import kernels, operations
 from experiments.timing import measure, measure_in_turns
 from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.cores import usable_cores
@@ -22,6 +23,9 @@ from sqt_jax.members import Layout, member_axes
 from sqt_jax.types import Array, Transition
 
 BATCH = 256
+NO_SETTINGS: Mapping[str, Any] = MappingProxyType({})
+LOOP_ROWS = 1_000_000  # of the replays of all members together, where a loop is measured
+PROFILED = 20  # lockstep steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +39,8 @@ class Row:
     rate: float
     compile_seconds: float
     operations: float = 0.0  # floating-point, of one unit; 0: not counted
+    kinds: tuple[kernels.Kind, ...] = ()  # what runs on the device, of a lockstep step; empty: not profiled
+    point: tuple[str, str, int] | None = None  # in a figure of growth: what is varied, the line, the value
 
 
 def member_keys(members: int) -> Array:
@@ -125,9 +131,9 @@ def bench_physics(task: str, members: int, solver: Mapping[str, dict[str, int]],
         yield Row("physics", f"{task}, {what}", members, "env steps", rate * members, compile_seconds)
 
 
-def bench_update(algo: str, task: str, members: int, **timing: Any) -> Row:
+def bench_update(algo: str, task: str, members: int, settings: Mapping[str, Any] = NO_SETTINGS, **timing: Any) -> Row:
     """Updates on one fixed batch: the learner alone, without environment and replay."""
-    run, count = updates(algo, task, members)
+    run, count = updates(algo, task, members, **settings)
     rate, compile_seconds = measure(run, **timing)
     return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds, count)
 
@@ -210,7 +216,13 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
 
 
 def bench_loops(
-    algo: str, task: str, members: int, physics: Sequence[str], devices: Sequence[int], **timing: Any
+    algo: str,
+    task: str,
+    members: int,
+    physics: Sequence[str],
+    devices: Sequence[int] = (1,),
+    profiled: bool = False,
+    **timing: Any,
 ) -> Iterator[Row]:
     """The whole training loop, on each physics and number of devices in turn: environment, insert, sample, update."""
     cases = {
@@ -221,15 +233,17 @@ def bench_loops(
     }
     runs, compile_seconds = zip(*(loop_steps(algo, task, members, *case) for case in cases.values()), strict=True)
     rates = measure_in_turns(runs, **timing)
-    for name, (rate, _), seconds in zip(cases, rates, compile_seconds, strict=True):
-        yield Row("loop", f"{algo} on {task}, {name}", members, "env steps", rate * members, seconds)
+    for name, run, (rate, _), seconds in zip(cases, runs, rates, compile_seconds, strict=True):
+        kinds = tuple(kernels.profile(run, PROFILED)) if profiled else ()
+        yield Row("loop", f"{algo} on {task}, {name}", members, "env steps", rate * members, seconds, kinds=kinds)
 
 
 def loop_steps(
     algo: str, task: str, members: int, physics: str, devices: int = 1
 ) -> tuple[Callable[[int], Any], float]:
     """A number of lockstep steps of training -> what it waits for; and the seconds of compilation."""
-    config = algorithms.make_config(algo, task, replay_capacity=100_000, physics=physics)
+    capacity = min(100_000, max(1_000, LOOP_ROWS // members))
+    config = algorithms.make_config(algo, task, replay_capacity=capacity, physics=physics)
     layout = Layout(members, tuple(jax.local_devices()[:devices]))
     sweep = train.make_sweep(algorithms.make_trainer(config), layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())

@@ -72,6 +72,26 @@ def test_physics_that_cannot_run_here_are_left_out_or_refused(monkeypatch):
         bench.physics_here()
 
 
+def test_a_suite_by_name_sets_the_flags_that_were_not_given():
+    bench.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(suite="gpu"), flagsaver.flagsaver():
+        bench.FLAGS["tasks"].present = 1
+        try:
+            bench.check_flags()
+            assert bench.FLAGS.members == ["5", "64", "512"] and bench.FLAGS.algos == ["td3", "td7"]
+            assert bench.FLAGS.profile and bench.FLAGS.suites == ["loop"]
+            assert bench.FLAGS.tasks == bench.PAPERS_TASKS  # as given
+        finally:
+            bench.FLAGS["tasks"].present = 0
+
+
+@pytest.mark.parametrize("name", bench.NAMED)
+def test_a_suite_by_name_is_one_that_could_be_typed(name):
+    bench.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(suite=name), flagsaver.flagsaver():
+        bench.check_flags()
+
+
 def test_a_peer_that_is_not_installed_is_told_before_anything_runs(monkeypatch):
     monkeypatch.setitem(bench.compare.NEEDS, "sbx", "no_such_module")
     bench.FLAGS.mark_as_parsed()

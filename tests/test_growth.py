@@ -1,0 +1,55 @@
+"""How cost grows: what is varied, and a figure for each."""
+
+import pytest
+
+from experiments import growth
+from experiments.measure import Row
+
+
+def row(point, rate):
+    return Row("growth", "", 5, "member updates", rate, 0.0, point=point)
+
+
+def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
+    made = []
+
+    def update(algo, task, members, settings=None, **timing):
+        made.append((algo, task, members, settings))
+        return row(None, 1.0)
+
+    def sample(kind, what, task, capacity, members, **timing):
+        made.append((kind, what, task, capacity, members))
+        return row(None, 1.0)
+
+    monkeypatch.setattr(growth, "bench_update", update)
+    monkeypatch.setattr(growth, "bench_replay", sample)
+    points = [found.point for found in growth.rows(["td3"], "ant", 5, seconds=0.0, repeats=1)]
+    assert points == [
+        *(("members", "td3", count) for count in growth.MEMBERS),
+        *(("critics", "td3", count) for count in growth.CRITICS),
+        *(("capacity", kind, capacity) for kind in ("uniform", "lap") for capacity in growth.CAPACITIES),
+    ]
+    assert ("td3", "ant", 50, None) in made and ("td3", "ant", 5, {"ensemble_size": 10}) in made
+    assert ("lap", "sample", "ant", 1_000_000, 5) in made
+
+
+def test_a_figure_shows_the_time_of_one_at_every_point(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(growth, "_draw", lambda points, x, y, path: shown.append((points, path.name)))
+    rows = [row(("members", "td3", 1), 100.0), row(("members", "td3", 5), 250.0), row(("capacity", "lap", 10), 1e6)]
+    growth.draw([*rows, Row("loop", "", 5, "env steps", 1.0, 0.0)], tmp_path)
+    assert shown == [
+        ({"td3": {1: pytest.approx(10.0), 5: pytest.approx(4.0)}}, "growth_members.png"),
+        ({"lap": {10: pytest.approx(1.0)}}, "growth_capacity.png"),
+    ]
+
+
+def test_figures_are_pictures_with_every_value_on_the_axis(tmp_path):
+    rows = [row(("members", name, count), 100.0 * count) for name in ("td3", "td7") for count in growth.MEMBERS]
+    (path,) = growth.draw(rows, tmp_path / "new")
+    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_what_did_not_grow_is_not_drawn(tmp_path):
+    assert growth.draw([Row("env", "", 5, "env steps", 1.0, 0.0)], tmp_path / "none") == []
+    assert not (tmp_path / "none").exists()
