@@ -32,7 +32,7 @@ from experiments.measure import (
     bench_loops,
     bench_physics,
     bench_replay,
-    bench_update,
+    bench_updates,
 )
 from experiments.measure_checkpoints import bench_checkpoint
 from sqt_jax import algorithms, envs
@@ -59,7 +59,7 @@ flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itsel
 flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
-flags.DEFINE_list("devices", ["1"], "Numbers of devices that the suite loop spreads its members over.")
+flags.DEFINE_list("devices", ["1"], "Numbers of devices that the suites update and loop spread their members over.")
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
 flags.DEFINE_boolean("profile", False, "Also count and time what the suite loop runs on the device.")
 flags.DEFINE_string("figures", "bench", "Folder of the suite growth's figures.")
@@ -118,7 +118,7 @@ def physics_here() -> list[str]:
 def rows(suites: Sequence[str], physics: Sequence[str], environment: Mapping[str, str], **timing: Any) -> Iterator[Row]:
     """What the flags ask for; `environment` is that of the peers' processes."""
     tasks, algos = FLAGS.tasks, FLAGS.algos
-    members = [int(value) for value in FLAGS.members]
+    members, devices = ([int(value) for value in getattr(FLAGS, name)] for name in ("members", "devices"))
     for suite in suites:
         for count in members:
             if suite == "env":
@@ -127,7 +127,8 @@ def rows(suites: Sequence[str], physics: Sequence[str], environment: Mapping[str
                 for task in tasks:
                     yield from bench_physics(task, count, solver_limits(), **timing)
             elif suite == "update":
-                yield from (bench_update(algo, task, count, **timing) for algo in algos for task in tasks)
+                for algo, task in itertools.product(algos, tasks):
+                    yield from bench_updates(algo, task, count, devices, **timing)
             elif suite == "replay":
                 yield from (
                     bench_replay(kind, what, tasks[0], int(size), count, **timing)
@@ -140,7 +141,6 @@ def rows(suites: Sequence[str], physics: Sequence[str], environment: Mapping[str
                     yield from bench_checkpoint(algo, task, count, timing["repeats"])
             elif suite == "loop":
                 for algo, task in itertools.product(algos, tasks):
-                    devices = [int(value) for value in FLAGS.devices]
                     yield from bench_loops(algo, task, count, physics, devices, FLAGS.profile, **timing)
             elif suite == "growth":
                 yield from growth.rows(algos, tasks[0], count, **timing)

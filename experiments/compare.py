@@ -74,8 +74,11 @@ class Peer:
 
 
 def lacks(peer: str, interpreter: str) -> bool:
-    """Whether the interpreter cannot import what the peer is made of."""
-    return subprocess.run([interpreter, "-c", f"import {NEEDS[peer]}"], capture_output=True).returncode != 0
+    """Whether the interpreter is none, or cannot import what the peer is made of."""
+    try:
+        return subprocess.run([interpreter, "-c", f"import {NEEDS[peer]}"], capture_output=True).returncode != 0
+    except OSError:
+        return True
 
 
 def ways(members: int) -> list[int]:

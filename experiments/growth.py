@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from experiments.figures import ALGORITHM_COLOURS, COLOURS, MARKERS
-from experiments.measure import REPLAYS, Row, bench_replay, bench_update
+from experiments.measure import REPLAYS, Row, bench_replay, bench_updates
 
 MEMBERS = (1, 2, 5, 10, 25, 50)
 CRITICS = (2, 5, 10)
@@ -28,10 +28,10 @@ def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterat
     """Updates over members and critics, samples over capacities; `members` where they do not vary."""
     for algo in algos:
         for count in MEMBERS:
-            row = bench_update(algo, task, count, **timing)
+            (row,) = bench_updates(algo, task, count, **timing)
             yield dataclasses.replace(row, suite="growth", point=("members", algo, count))
         for count in CRITICS:
-            row = bench_update(algo, task, members, {"ensemble_size": count}, **timing)
+            (row,) = bench_updates(algo, task, members, settings={"ensemble_size": count}, **timing)
             what = f"{row.what}, {count} critics"
             yield dataclasses.replace(row, suite="growth", what=what, point=("critics", algo, count))
     for kind in REPLAYS:

@@ -131,14 +131,29 @@ def bench_physics(task: str, members: int, solver: Mapping[str, dict[str, int]],
         yield Row("physics", f"{task}, {what}", members, "env steps", rate * members, compile_seconds)
 
 
-def bench_update(algo: str, task: str, members: int, settings: Mapping[str, Any] = NO_SETTINGS, **timing: Any) -> Row:
-    """Updates on one fixed batch: the learner alone, without environment and replay."""
-    run, count = updates(algo, task, members, **settings)
-    rate, compile_seconds = measure(run, **timing)
-    return Row("update", f"{algo}, {task} sizes", members, "member updates", rate * members, compile_seconds, count)
+def bench_updates(
+    algo: str,
+    task: str,
+    members: int,
+    devices: Sequence[int] = (1,),
+    settings: Mapping[str, Any] = NO_SETTINGS,
+    **timing: Any,
+) -> Iterator[Row]:
+    """Updates on one fixed batch, on each number of devices in turn: the learner alone."""
+    cases = {_on("sizes", count): count for count in devices if count <= members}
+    runs, counts = zip(*(updates(algo, task, members, count, **settings) for count in cases.values()), strict=True)
+    rates = measure_in_turns(runs, **timing)
+    for name, count, (rate, seconds) in zip(cases, counts, rates, strict=True):
+        yield Row("update", f"{algo}, {task} {name}", members, "member updates", rate * members, seconds, count)
 
 
-def updates(algo: str, task: str, members: int, **settings: Any) -> tuple[Callable[[int], Any], float]:
+def _on(what: str, devices: int) -> str:
+    return f"{what}, {devices} devices" if devices > 1 else what
+
+
+def updates(
+    algo: str, task: str, members: int, devices: int = 1, **settings: Any
+) -> tuple[Callable[[int], Any], float]:
     """A number of updates -> the state after them; and the floating-point operations of one member's update."""
     config = algorithms.make_config(algo, task, **settings)
     env = envs.make(task)
@@ -158,17 +173,18 @@ def updates(algo: str, task: str, members: int, **settings: Any) -> tuple[Callab
 
     example = jax.eval_shape(agent.init, jax.random.key(0))
     axes = member_axes(example)
-    update = jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0))
+    layout = Layout(members, tuple(jax.local_devices()[:devices]))
 
-    @jax.jit
-    def run(state, batch, keys, steps):
+    def loop(state, batch, key, steps):
         def body(i, state):
-            return update(state, batch, jax.vmap(jax.random.fold_in, (0, None))(keys, i))[0]
+            return agent.update(state, batch, jax.random.fold_in(key, i))[0]
 
         return jax.lax.fori_loop(0, steps, body, state)
 
-    keys = member_keys(members)
-    state, batch = jax.jit(jax.vmap(agent.init, out_axes=axes))(keys), jax.vmap(random_batch)(keys)
+    run = jax.jit(layout.over_members(loop, (axes, 0, 0, None), axes))
+    keys = layout.filled(member_keys(members))
+    state = jax.jit(layout.over_members(agent.init, (0,), axes))(keys)
+    batch = jax.jit(layout.over_members(random_batch, (0,), 0))(keys)
     one = jax.eval_shape(random_batch, jax.random.key(0))
     count = operations.of_update(agent, example, one, config.agent.policy_delay)
     return lambda steps: run(state, batch, keys, steps), count
@@ -225,12 +241,7 @@ def bench_loops(
     **timing: Any,
 ) -> Iterator[Row]:
     """The whole training loop, on each physics and number of devices in turn: environment, insert, sample, update."""
-    cases = {
-        f"{name}, {count} devices" if count > 1 else name: (name, count)
-        for name in physics
-        for count in devices
-        if count <= members
-    }
+    cases = {_on(name, count): (name, count) for name in physics for count in devices if count <= members}
     runs, compile_seconds = zip(*(loop_steps(algo, task, members, *case) for case in cases.values()), strict=True)
     rates = measure_in_turns(runs, **timing)
     for name, run, (rate, _), seconds in zip(cases, runs, rates, compile_seconds, strict=True):

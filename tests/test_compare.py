@@ -56,6 +56,7 @@ def test_what_an_interpreter_cannot_import_is_known(monkeypatch):
     monkeypatch.setitem(compare.NEEDS, "sbx", "no_such_module")
     monkeypatch.setitem(compare.NEEDS, "torch", "json")
     assert compare.lacks("sbx", sys.executable) and not compare.lacks("torch", sys.executable)
+    assert compare.lacks("torch", "/no/such/python") and compare.lacks("torch", os.sep)
 
 
 def test_several_seeds_are_trained_in_every_way(monkeypatch):

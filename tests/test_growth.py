@@ -15,13 +15,13 @@ def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
 
     def update(algo, task, members, settings=None, **timing):
         made.append((algo, task, members, settings))
-        return row(None, 1.0)
+        yield row(None, 1.0)
 
     def sample(kind, what, task, capacity, members, **timing):
         made.append((kind, what, task, capacity, members))
         return row(None, 1.0)
 
-    monkeypatch.setattr(growth, "bench_update", update)
+    monkeypatch.setattr(growth, "bench_updates", update)
     monkeypatch.setattr(growth, "bench_replay", sample)
     points = [found.point for found in growth.rows(["td3"], "ant", 5, seconds=0.0, repeats=1)]
     assert points == [

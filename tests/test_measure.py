@@ -1,5 +1,6 @@
 """The benchmark's measurements: rows that say what was measured."""
 
+import jax
 import pytest
 
 from experiments import measure
@@ -25,7 +26,15 @@ def test_mujoco_alone_steps_with_and_without_contact_forces(task, monkeypatch):
 
 
 def test_an_updates_row_counts_the_updates_of_all_members():
-    row = measure.bench_update("td7_sqt", "cheetah", 2, **SHORT)
+    (row,) = measure.bench_updates("td7_sqt", "cheetah", 2, **SHORT)
     assert (row.suite, row.what, row.members) == ("update", "td7_sqt, cheetah sizes", 2)
     assert row.unit == "member updates" and row.rate > 0
     assert 2e9 < row.operations < 3e9
+
+
+@pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
+def test_an_update_is_measured_on_each_number_of_devices_that_has_members():
+    settings = {"hidden": (16, 16), "batch_size": 16}
+    rows = list(measure.bench_updates("td3", "cheetah", 2, (1, 2, 5), settings, **SHORT))
+    assert [row.what for row in rows] == ["td3, cheetah sizes", "td3, cheetah sizes, 2 devices"]
+    assert rows[0].operations == rows[1].operations > 0
