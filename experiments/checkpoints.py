@@ -19,10 +19,10 @@ import numpy as np
 from experiments import files, manifests
 from experiments.loop import Position
 from experiments.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
-from sqt_jax.members import Layout
+from sqt_jax.members import Layout, member_axes
 from sqt_jax.train import TrainState, state_axes
 from sqt_jax.trees import by_path, from_paths
-from sqt_jax.types import Array, Replay
+from sqt_jax.types import Array, Replay, State
 
 PIECE_BYTES = 64_000_000  # of replay rows: what is held on the host at once
 
@@ -53,6 +53,20 @@ class Checkpoints:
         self._steps: dict[Step, int] = {}  # checkpoints that are wanted, in order -> the step of their last evaluation
         self._writer: threading.Thread | None = None
 
+        def rows(state: State, first: Array, count: int) -> Array:
+            def own(state: State, first: Array) -> Array:
+                return replay.rows(state, first, count)
+
+            return layout.over_members(own, (member_axes(state), None), 0)(state, first)
+
+        def with_rows(state: State, rows: Array, first: Array) -> State:
+            axes = member_axes(state)
+            return layout.over_members(replay.with_rows, (axes, 0, None), axes)(state, rows, first)
+
+        self._rows_of = jax.jit(rows, static_argnames="count")
+        self._with_rows = jax.jit(with_rows, donate_argnums=0)
+        self._row_width = jax.eval_shape(lambda: replay.rows(replay.init(), 0, 1)).shape[1]
+
     def save(self, state: TrainState, position: Position, lengths: dict[str, int]) -> None:
         """Writes the rows, copies the rest, and writes that while training goes on (`wait`).
 
@@ -63,17 +77,16 @@ class Checkpoints:
         same = [step for step in self._steps if step.env_steps == position.env_steps]
         if any(self._steps[step] == position.evaluated for step in same):
             return  # the same state, since training is deterministic
-        storage = self.replay.storage(state.replay)
         try:
             self.path.mkdir(exist_ok=True)
-            self._write_rows(storage, position.env_steps)
+            self._write_rows(state.replay, position.env_steps)
         except OSError as error:
             self._failed(position.env_steps, error)
             return
         rest = self._without_rows(state)
         own = by_path(state_axes(rest))
         arrays = {name: self._host_copy(leaf, name in own) for name, leaf in _held(rest).items()}
-        arguments = (Step(position.env_steps, len(same)), arrays, storage.shape[1], position, lengths)
+        arguments = (Step(position.env_steps, len(same)), arrays, position, lengths)
         self._writer = threading.Thread(target=self._write, args=arguments, daemon=True)
         self._writer.start()
 
@@ -94,13 +107,12 @@ class Checkpoints:
         Raises:
           Refused: none is whole, or one cannot be read or is of another run.
         """
-        capacity = self.replay.storage(template.replay).shape[1]
         whole: dict[Step, Manifest] = {}
         found = manifests.steps_in(self.path)
         for step in reversed(found):
             try:
                 manifest = manifests.read(self.path, step)
-                manifests.verify(self.path, step, manifest, capacity, *self.sizes(template))
+                manifests.verify(self.path, step, manifest, self.replay.capacity, *self.sizes(template))
                 whole[step] = manifest
             except Unusable as error:
                 self.warn(f"the checkpoint at step {step.env_steps:,} cannot be used: {error}")
@@ -127,26 +139,24 @@ class Checkpoints:
     def sizes(self, template: TrainState) -> tuple[int, int]:
         """Bytes of a checkpoint without the replay, and of the replay's rows per env step; `template` as above."""
         rest = sum(_on_host(leaf).nbytes for leaf in jax.tree.leaves(self._without_rows(template)))
-        members, _, width = self.replay.storage(template.replay).shape
-        return rest, 4 * members * width
+        return rest, 4 * self.layout.members * self._row_width
 
-    def _write_rows(self, storage: Array, stop: int) -> None:
-        held, capacity, width = storage.shape
-        piece = max(1, PIECE_BYTES // (4 * held * width))
+    def _write_rows(self, replay: State, stop: int) -> None:
+        capacity = self.replay.capacity
+        piece = max(1, PIECE_BYTES // (4 * self.layout.held * self._row_width))
         start = max(self._rows_end, stop - capacity)
         while start < stop:
             in_ring = start % capacity
             count = min(piece, stop - start, capacity - in_ring)
-            rows = np.asarray(_slice(storage, in_ring, count))[: self.layout.members].data
+            rows = np.asarray(self._rows_of(replay, jnp.int32(in_ring), count=count))[: self.layout.members].data
             file = Rows(start, start + count, zlib.crc32(rows))
             with files.whole_file(self.path / file.name) as out:
                 out.write(rows)
             self._rows.append(file)
             start = self._rows_end = start + count
 
-    def _write(
-        self, step: Step, arrays: dict[str, np.ndarray], capacity: int, position: Position, lengths: dict[str, int]
-    ) -> None:
+    def _write(self, step: Step, arrays: dict[str, np.ndarray], position: Position, lengths: dict[str, int]) -> None:
+        capacity = self.replay.capacity
         part = self.path / f"{step.name}.part"
         try:
             _remove(part)
@@ -186,30 +196,36 @@ class Checkpoints:
             raise
         except Exception as error:  # whatever Orbax says of a folder that is not its own
             raise Refused(f"Orbax cannot read its checkpoint ({type(error).__name__})") from None
-        empty = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in by_path(rest).items() if not leaf.size}
-        own = by_path(state_axes(rest))
-        leaves = {name: self._on_devices(arrays[name], leaf, name in own) for name, leaf in _held(rest).items()}
-        state = from_paths(rest, leaves | empty)
+        own = by_path(state_axes(template))
+        leaves = {
+            # What is not there has no entries, or comes with the rows.
+            name: self._on_devices(arrays.get(name), leaf, name in own)
+            for name, leaf in by_path(template).items()
+        }
+        state = from_paths(template, leaves)
         if int(state.env_steps) != step.env_steps:
             raise Refused(f"its checkpoint at step {step.env_steps:,} is of step {int(state.env_steps):,}")
-        shape = self.replay.storage(template.replay).shape
-        storage = jnp.zeros((self.layout.held, *shape[1:]), jnp.float32, device=self.layout.sharding(0))
+        replay = state.replay
         for file in manifest.rows:
-            values = np.fromfile(self.path / file.name, np.float32).reshape(shape[0], -1, shape[2])
-            storage = _write_slice(storage, self.layout.filled(values), file.start % shape[1])
-        return state._replace(replay=self.replay.with_storage(state.replay, storage))
+            rows = np.fromfile(self.path / file.name, np.float32).reshape(self.layout.members, -1, self._row_width)
+            replay = self._with_rows(replay, self.layout.filled(rows), jnp.int32(file.start % self.replay.capacity))
+        return state._replace(replay=replay)
 
     def _host_copy(self, leaf: Array, own: bool) -> np.ndarray:
         array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
         # A copy: training goes on in the same memory while it is written.
         return np.array(array[: self.layout.members] if own else array)
 
-    def _on_devices(self, array: np.ndarray, like: Any, own: bool) -> Array:
-        there = jax.device_put(self.layout.filled(array) if own else array, self.layout.sharding(0 if own else None))
+    def _on_devices(self, array: np.ndarray | None, like: Any, own: bool) -> Array:
+        """`array`, or zeros, of the shape `like` but for the copies of members."""
+        sharding = self.layout.sharding(0 if own else None)
+        if array is None:
+            return jnp.zeros((self.layout.held, *like.shape[1:]) if own else like.shape, like.dtype, device=sharding)
+        there = jax.device_put(self.layout.filled(array) if own else array, sharding)
         return jax.random.wrap_key_data(there) if _is_key(like) else there
 
     def _without_rows(self, state: TrainState) -> TrainState:
-        return state._replace(replay=self.replay.with_storage(state.replay, None))  # type: ignore[arg-type]
+        return state._replace(replay=self.replay.without_rows(state.replay))
 
 
 def _remove(path: Path) -> None:
@@ -242,16 +258,3 @@ def _is_key(leaf: Any) -> bool:
 def _on_host(leaf: Any) -> np.ndarray:
     shape = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
     return np.zeros(shape.shape, shape.dtype)
-
-
-def _slice(storage: Array, start: int, count: int) -> Array:
-    return jax.lax.dynamic_slice_in_dim(storage, jnp.int32(start), count, axis=1)
-
-
-def _write_slice(storage: Array, rows: np.ndarray, start: int) -> Array:
-    return _update(storage, rows, jnp.int32(start))
-
-
-_update = jax.jit(
-    lambda storage, rows, start: jax.lax.dynamic_update_slice_in_dim(storage, rows, start, axis=1), donate_argnums=0
-)

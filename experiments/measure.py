@@ -20,6 +20,7 @@ from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
 from sqt_jax.members import Layout, member_axes
+from sqt_jax.ring import Ring
 from sqt_jax.types import Array, Transition
 
 BATCH = 256
@@ -196,7 +197,8 @@ REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}
 def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
     """One insert of a row, or one sampled batch and what it feeds back, on a full buffer."""
     env = envs.make(task)
-    store = REPLAYS[kind](capacity, BATCH, env.observation_size, env.action_size)
+    ring = Ring(capacity, env.observation_size, env.action_size, shortest_episode=env.shortest_episode)
+    store = REPLAYS[kind](ring, BATCH)
     axes = member_axes(jax.eval_shape(store.init))
     obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
 

@@ -27,8 +27,6 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     sweep = train.make_sweep(trainer)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
-    storage = jax.random.normal(jax.random.key(0), replay.storage(state.replay).shape)
-    state = state._replace(replay=replay.with_storage(state.replay, storage))
     everything, later, waits, size = [], [], [], 0
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:

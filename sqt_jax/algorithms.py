@@ -24,6 +24,7 @@ from sqt_jax.config import (
     check_train,
 )
 from sqt_jax.names import nearest, unknown
+from sqt_jax.ring import Ring
 from sqt_jax.types import Agent, Environment, Replay
 
 
@@ -188,11 +189,11 @@ def agent_of(config: Config, env: Environment) -> Agent:
 
 def replay_of(config: Config, env: Environment) -> Replay:
     """The replay buffer of an experiment, for an environment's sizes."""
-    sizes = (config.train.capacity, config.train.batch_size, env.observation_size, env.action_size)
+    agent, settings = config.agent, config.train
+    rows = Ring(settings.capacity, env.observation_size, env.action_size, settings.num_envs, env.shortest_episode)
     if not ALGORITHMS[config.algo].assessed:
-        return replay.uniform(*sizes)
-    agent = config.agent
-    return lap.lap(*sizes, agent.priority_exponent, agent.min_priority, agent.target_update_period)
+        return replay.uniform(rows, settings.batch_size)
+    return lap.lap(rows, settings.batch_size, agent.priority_exponent, agent.min_priority, agent.target_update_period)
 
 
 def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:

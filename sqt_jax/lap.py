@@ -12,14 +12,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sqt_jax import replay
+from sqt_jax.ring import Ring, RingState
 from sqt_jax.types import Array, Replay, Transition
 
 BLOCK = 128
 
 
 class LapState(NamedTuple):
-    rows: replay.UniformState
+    rows: RingState
     levels: tuple[Array, ...]  # [blocks, BLOCK] each: priorities, sums of their blocks, ...; the last has one block
     max_priority: Array  # []: what new rows get
 
@@ -71,10 +71,8 @@ def draw_rows(key: Array, levels: tuple[Array, ...], batch_size: int) -> Array:
 
 
 def lap(
-    capacity: int,
+    ring: Ring,
     batch_size: int,
-    observation_size: int,
-    action_size: int,
     priority_exponent: float = 0.4,
     min_priority: float = 1.0,
     refresh_every: int = 250,
@@ -83,20 +81,23 @@ def lap(
 
     New rows get the largest priority seen; every `refresh_every` updates that becomes the largest in the buffer.
     """
-    store = replay.uniform(capacity, batch_size, observation_size, action_size)
 
     def init() -> LapState:
-        levels = tuple(jnp.zeros(shape) for shape in _shapes(capacity))
-        return LapState(store.init(), levels, jnp.ones(()))
+        levels = tuple(jnp.zeros(shape) for shape in _shapes(ring.capacity))
+        return LapState(ring.init(), levels, jnp.ones(()))
 
     def insert(state: LapState, transition: Transition) -> LapState:
-        index = state.rows.pointer + jnp.arange(transition.reward.shape[0])
-        levels = set_priorities(state.levels, index, jnp.broadcast_to(state.max_priority, index.shape))
-        return LapState(store.insert(state.rows, transition), levels, state.max_priority)
+        rows, lost = ring.insert(state.rows, transition)
+        new = state.rows.inserted % ring.capacity + jnp.arange(ring.num_envs)
+        # A transition without its final observation is drawn no more; where there is none, a new row is set twice.
+        gone = lost >= rows.inserted - ring.capacity
+        index = jnp.concatenate([new, jnp.where(gone, lost % ring.capacity, new)])
+        value = jnp.where(jnp.concatenate([jnp.zeros_like(gone), gone]), 0.0, state.max_priority)
+        return LapState(rows, set_priorities(state.levels, index, value), state.max_priority)
 
     def sample(state: LapState, key: Array) -> tuple[Transition, Array]:
         index = draw_rows(key, state.levels, batch_size)
-        return replay.unpack(state.rows.storage[index], observation_size, action_size), index
+        return ring.read(state.rows, index), index
 
     def feedback(state: LapState, index: Array, td_error: Array, gradient_steps: Array) -> LapState:
         new = priority(td_error, priority_exponent, min_priority)
@@ -107,10 +108,13 @@ def lap(
         highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
         return LapState(state.rows, levels, highest)
 
-    def storage(state: LapState) -> Array:
-        return store.storage(state.rows)
+    def rows(state: LapState, first: Array | int, count: int) -> Array:
+        return ring.rows(state.rows, first, count)
 
-    def with_storage(state: LapState, rows: Array) -> LapState:
-        return state._replace(rows=store.with_storage(state.rows, rows))
+    def with_rows(state: LapState, rows: Array, first: Array | int) -> LapState:
+        return state._replace(rows=ring.with_rows(state.rows, rows, first))
 
-    return Replay(init, insert, sample, feedback, storage, with_storage)
+    def without_rows(state: LapState) -> LapState:
+        return state._replace(rows=ring.without_rows(state.rows))
+
+    return Replay(ring.capacity, init, insert, sample, feedback, rows, with_rows, without_rows)

@@ -17,7 +17,7 @@ from sqt_jax.types import State
 
 AXIS = "members"
 # Leaves that are equal in all members, which advance in lockstep.
-SHARED_LEAVES = frozenset({"env_steps", "gradient_steps", "pointer", "size"})
+SHARED_LEAVES = frozenset({"env_steps", "gradient_steps", "inserted"})
 
 
 def member_axes(state: State) -> Any:

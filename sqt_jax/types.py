@@ -61,6 +61,7 @@ class Environment(NamedTuple):
     step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
     set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
     status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts worth reporting, summed over environments
+    shortest_episode: int = 1  # steps that episodes take at least, in the mean: the replay has room for such (`Ring`)
 
 
 class Agent(NamedTuple):
@@ -89,15 +90,18 @@ class Agent(NamedTuple):
 class Replay(NamedTuple):
     """A store of transitions as pure functions of one member's state.
 
-    The k-th transition ever inserted lies in row k mod capacity of the storage.
+    The k-th transition ever inserted lies in row k mod `capacity`. What was inserted stays as it is until it is
+    overwritten, so that checkpoints write each row once.
     """
 
+    capacity: int
     init: Callable[[], State]
     insert: Callable[[State, Transition], State]  # E new transitions at once
     sample: Callable[[State, Array], tuple[Transition, Array]]  # (state, key) -> B transitions, their rows [B]
     feedback: Callable[[State, Array, Array, Array], State]  # (state, rows [B], td_error [B], gradient_steps) -> state
-    storage: Callable[[State], Array]  # state -> the rows [capacity, W]: nearly all of its bytes
-    with_storage: Callable[[State, Array], State]  # the state with other rows
+    rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows to keep on disk [count, floats]
+    with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state: they are back
+    without_rows: Callable[[State], State]  # state -> what else is to be kept: None for the arrays of the rows
 
 
 class Scalars(NamedTuple):

@@ -50,21 +50,21 @@ def countdown(length: int = 3) -> Environment:
     return make_environment("countdown", 1, 1, 100, start, advance)
 
 
-class Sized(NamedTuple):
-    size: jax.Array
+class Named(NamedTuple):
+    inserted: jax.Array
 
 
-def with_a_field_called_size() -> Environment:
+def with_a_field_called_inserted() -> Environment:
     """A state with a field of the name of one of the trainer's counters."""
 
     def start(key):
-        size = jax.random.uniform(key, minval=1.0, maxval=2.0)
-        return Sized(size), size[None]
+        value = jax.random.uniform(key, minval=1.0, maxval=2.0)
+        return Named(value), value[None]
 
     def advance(state, action):
-        return state, state.size[None], state.size, jnp.zeros((), bool)
+        return state, state.inserted[None], state.inserted, jnp.zeros((), bool)
 
-    return make_environment("sized", 1, 1, 5, start, advance)
+    return make_environment("named", 1, 1, 5, start, advance)
 
 
 def diverging() -> Environment:

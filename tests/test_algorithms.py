@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 from probe_envs import constant_reward
 
-from sqt_jax import lap, replay
+from sqt_jax import lap
 from sqt_jax.agents import sac, td3, td7
 from sqt_jax.algorithms import (
     AGENT_SETTINGS,
@@ -19,6 +19,7 @@ from sqt_jax.algorithms import (
     replay_of,
 )
 from sqt_jax.config import ConfigError
+from sqt_jax.ring import RingState
 from sqt_jax.types import Transition
 
 VARIANTS = {"": ("none", 0.0), "_sqt": ("batch_std", 0.5), "_sqt_tuple": ("transition_std", 0.1)}
@@ -124,7 +125,7 @@ def test_an_environment_of_ones_own_gives_the_sizes(algo):
     state = jax.eval_shape(make_trainer(config, env).init, jax.random.key(0))
     assert jax.tree.structure(state.agent) == jax.tree.structure(agent)
     storage = (state.replay.rows if algo in TD7 else state.replay).storage
-    assert storage.shape == (300, 2 * env.observation_size + env.action_size + 2)
+    assert storage.shape == (300, env.observation_size + env.action_size + 3)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -146,7 +147,7 @@ def test_the_replay_is_lap_for_td7_alone_with_the_agents_settings(algo):
     env = constant_reward()
     if algo not in TD7:
         state = replay_of(make_config(algo, "ant", replay_capacity=300), env).init()
-        assert isinstance(state, replay.UniformState)
+        assert isinstance(state, RingState)
         return
     settings = {"priority_exponent": 0.5, "min_priority": 4.0, "target_update_period": 3}
     buffer = replay_of(make_config(algo, "ant", replay_capacity=300, **settings), env)

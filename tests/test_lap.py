@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sqt_jax import lap, replay
+from sqt_jax import lap
+from sqt_jax.members import member_axes
+from sqt_jax.ring import Ring
 from sqt_jax.types import Transition
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
@@ -25,12 +27,13 @@ def transitions(ids) -> Transition:
     """Transitions whose reward is the id (from 1), and so told from an empty row, which is all zeros."""
     ids = np.asarray(ids, np.float32)
     obs, action = np.repeat(ids[..., None], O, -1), np.repeat(-ids[..., None], A, -1)
-    return Transition(obs, action, ids, obs + 0.5, np.ones_like(ids))
+    return Transition(obs, action, ids, obs + 1, np.ones_like(ids))
 
 
 @cache
-def compiled(capacity=CAPACITY, batch=BATCH):
-    buffer = lap.lap(capacity, batch, O, A, EXPONENT, MIN_PRIORITY, REFRESH)
+def compiled(num_envs=1, capacity=CAPACITY, batch=BATCH, shortest_episode=1):
+    ring = Ring(capacity, O, A, num_envs, shortest_episode)
+    buffer = lap.lap(ring, batch, EXPONENT, MIN_PRIORITY, REFRESH)
     return buffer.init, jax.jit(buffer.insert), jax.jit(buffer.sample), jax.jit(buffer.feedback)
 
 
@@ -61,8 +64,20 @@ def assert_levels_agree(levels, priorities):
 
 def filled(rows=CAPACITY):
     """A buffer with `rows` rows, whose ids are 1, 2, ..."""
-    init, insert, *_ = compiled()
-    return insert(init(), transitions(np.arange(1, 1 + rows)))
+    return extended(compiled()[0](), np.arange(1, 1 + rows))
+
+
+@jax.jit
+def extended(state, ids):
+    """The buffer after inserts of one row each."""
+    insert = compiled()[1]
+    return jax.lax.scan(lambda state, new: (insert(state, new), None), state, transitions_one_by_one(ids))[0]
+
+
+def transitions_one_by_one(ids):
+    obs, action = jnp.repeat(ids[:, None, None], O, -1), jnp.repeat(-ids[:, None, None], A, -1)
+    one = Transition(obs, action, ids[:, None], obs + 1, jnp.ones_like(ids)[:, None])
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), one)
 
 
 # Sums
@@ -73,27 +88,25 @@ def filled(rows=CAPACITY):
     [(1, [1]), (128, [1]), (129, [2, 1]), (128**2, [128, 1]), (128**2 + 1, [129, 2, 1]), (10**6, [7813, 62, 1])],
 )
 def test_levels_shrink_by_the_block_size_down_to_one_block(capacity, blocks):
-    state = jax.eval_shape(lap.lap(capacity, 1, O, A).init)
+    state = jax.eval_shape(lap.lap(Ring(capacity, O, A), 1).init)
     assert [level.shape for level in state.levels] == [(count, lap.BLOCK) for count in blocks]
-    assert state.rows.storage.shape == (capacity, replay.row_width(O, A))
 
 
 @given(data=st.data())
 def test_all_sums_stay_those_of_a_plain_model(data):
     """Inserts and feedback at random; after each, every level is what NumPy sums up and nothing else has changed."""
-    init, insert, _, feedback = compiled()
+    num_envs = data.draw(st.sampled_from([1, 50, 250]))
+    init, insert, _, feedback = compiled(num_envs)
     generator = np.random.default_rng(data.draw(st.integers(0, 10**6)))
     state = init()
     priorities, highest, pointer, size = np.zeros(CAPACITY, np.float32), 1.0, 0, 0
-    actions = data.draw(st.lists(st.sampled_from([1, 50, 250, "feedback"]), min_size=1, max_size=12))
+    actions = data.draw(st.lists(st.sampled_from(["insert", "insert", "feedback"]), min_size=1, max_size=12))
     for step, action in enumerate(actions):
-        if action != "feedback":
-            if pointer % action:  # inserts of another width would straddle the end
-                continue
-            rows = np.arange(pointer, pointer + action)
+        if action == "insert":
+            rows = np.arange(pointer, pointer + num_envs)
             state = insert(state, transitions(rows + 1.0))
             priorities[rows] = highest
-            pointer, size = (pointer + action) % CAPACITY, min(size + action, CAPACITY)
+            pointer, size = (pointer + num_envs) % CAPACITY, min(size + num_envs, CAPACITY)
         elif size:
             rows = generator.choice(size, size=min(BATCH, size), replace=False)
             rows = np.resize(rows, BATCH)  # few rows: duplicates, with equal errors
@@ -103,7 +116,6 @@ def test_all_sums_stay_those_of_a_plain_model(data):
             highest = max(highest, priorities[rows].max())
         assert_levels_agree(state.levels, priorities)
         np.testing.assert_allclose(state.max_priority, highest, rtol=1e-6)
-        assert (state.rows.pointer, state.rows.size) == (pointer, size)
 
 
 def test_sums_do_not_drift():
@@ -210,7 +222,7 @@ def test_an_empty_row_is_never_drawn_whatever_the_order_of_summation(monkeypatch
 
 
 def test_a_batch_holds_the_rows_that_were_drawn():
-    init, insert, sample, _ = compiled()
+    *_, sample, _ = compiled()
     state = filled(125)
     for seed in range(20):
         batch, rows = sample(state, jax.random.key(seed))
@@ -256,13 +268,12 @@ def give(state, error, gradient_steps, rows=0):
 
 
 def test_new_rows_get_the_largest_priority_seen():
-    _, insert, *_ = compiled()
     state = filled(100)
     assert state.max_priority == 1 and np.all(np.ravel(state.levels[0])[:100] == 1)
     state = give(state, 32.0, 1)
     np.testing.assert_allclose(state.max_priority, 4, rtol=1e-6)
     state = give(state, 0.0, 2)  # a smaller one later does not lower it, though no row has it any more
-    state = insert(state, transitions(range(101, 201)))
+    state = extended(state, np.arange(101, 201))
     priorities = np.ravel(state.levels[0])
     np.testing.assert_allclose(priorities[100:200], 4, rtol=1e-6)
     np.testing.assert_array_equal(priorities[:100], 1)
@@ -292,24 +303,32 @@ def test_a_row_that_is_overwritten_loses_its_old_priority():
     assert_levels_agree(state.levels, np.ravel(state.levels[0])[:CAPACITY])
 
 
-def test_an_insert_that_could_straddle_the_end_is_refused():
-    buffer = lap.lap(CAPACITY, BATCH, O, A)
-    with pytest.raises(ValueError, match="multiple of the rows inserted at once .3."):
-        buffer.insert(buffer.init(), transitions([1, 2, 3]))
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
+    """Every episode is one step, and there is room for those of a tenth of the rows."""
+    init, insert, *_ = compiled(num_envs, capacity=40, shortest_episode=10)
+    state, room = init(), 4 + num_envs
+    for step in range(1, 60 // num_envs):
+        state = insert(state, transitions(1 + step * 10 + np.arange(num_envs)))
+        # The newest rows' next observations are not among the final ones yet.
+        expected = np.zeros(40)
+        newest = np.arange(step * num_envs)[-room - num_envs :]
+        expected[newest % 40] = 1
+        assert_levels_agree(state.levels, expected)
 
 
 # Cost
 
 MEMBERS = 3
-AXES = lap.LapState(replay.UniformState(storage=0, pointer=None, size=None), levels=0, max_priority=0)
 
 
 def training_loop(capacity):
     """Insert, sample and feedback of a sweep's members in a loop, compiled as in the training program."""
-    buffer = lap.lap(capacity, 64, O, A)
-    insert = jax.vmap(buffer.insert, in_axes=(AXES, 0), out_axes=AXES)
-    sample = jax.vmap(buffer.sample, in_axes=(AXES, 0))
-    feedback = jax.vmap(buffer.feedback, in_axes=(AXES, 0, 0, None), out_axes=AXES)
+    buffer = lap.lap(Ring(capacity, O, A, shortest_episode=8), 64)
+    axes = member_axes(jax.eval_shape(buffer.init))
+    insert = jax.vmap(buffer.insert, in_axes=(axes, 0), out_axes=axes)
+    sample = jax.vmap(buffer.sample, in_axes=(axes, 0))
+    feedback = jax.vmap(buffer.feedback, in_axes=(axes, 0, 0, None), out_axes=axes)
 
     def loop(state, transition, key):
         def body(i, state):
@@ -319,7 +338,7 @@ def training_loop(capacity):
 
         return jax.lax.fori_loop(0, 1000, body, state)
 
-    state = jax.eval_shape(jax.vmap(lambda _: buffer.init(), out_axes=AXES), jnp.arange(MEMBERS))
+    state = jax.eval_shape(jax.vmap(lambda _: buffer.init(), out_axes=axes), jnp.arange(MEMBERS))
     new = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, transitions(np.ones((MEMBERS, 1)))))
     executable = jax.jit(loop, donate_argnums=0).lower(state, new, jax.random.key(0)).compile()
     return state, executable
@@ -333,7 +352,9 @@ def loops():
 
 def held_shapes(state):
     """What grows with the capacity, as the compiled text writes it."""
-    return ["f32[" + ",".join(map(str, leaf.shape)) + "]" for leaf in (state.rows.storage, *state.levels[:-1])]
+    arrays = state.rows.storage, *state.levels[:-1], state.rows.finals, state.rows.owners
+    kinds = {"float32": "f32", "int32": "s32"}
+    return [f"{kinds[leaf.dtype.name]}[{','.join(map(str, leaf.shape))}]" for leaf in arrays]
 
 
 def instructions(text):

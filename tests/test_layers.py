@@ -18,9 +18,9 @@ LAYERS = [
         "sqt_jax.losses",
         "sqt_jax.bias",
         "sqt_jax.optimizers",
-        "sqt_jax.replay",
+        "sqt_jax.ring",
     },
-    {"sqt_jax.lap", "sqt_jax.sale"},  # on top of replay and networks
+    {"sqt_jax.replay", "sqt_jax.lap", "sqt_jax.sale"},  # on top of ring and networks
     {"sqt_jax.agents", "sqt_jax.envs"},
     {"sqt_jax.rollout"},
     {"sqt_jax.evaluate"},
@@ -32,11 +32,13 @@ LAYERS = [
 ]
 PACKAGES = ("sqt_jax.agents", "sqt_jax.envs", "experiments")
 # Beyond the order of the layers.
-REPLAYS = ("sqt_jax.replay", "sqt_jax.lap")
+REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
 NETWORKS = ("sqt_jax.networks", "sqt_jax.sale", "sqt_jax.losses", "sqt_jax.q_targets")
 NEVER = {
     "sqt_jax.agents": ("sqt_jax.envs", *REPLAYS),
     "sqt_jax.envs": ("sqt_jax.agents", *REPLAYS, *NETWORKS),
+    "sqt_jax.ring": NETWORKS,
+    "sqt_jax.replay": NETWORKS,
     "sqt_jax.lap": NETWORKS,
     # agent, environment and replay come as values
     "sqt_jax.train": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),

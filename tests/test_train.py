@@ -68,7 +68,7 @@ def test_warmup_makes_steps_and_no_updates(td3):
     config, _, sweep = td3
     before = start(config, sweep)
     after, metrics = advance(sweep, start(config, sweep), 40, False)
-    assert after.env_steps == 40 and after.agent.gradient_steps == 0 and after.replay.size == 40
+    assert after.env_steps == 40 and after.agent.gradient_steps == 0 and after.replay.inserted == 40
     assert identical(before.agent, after.agent)
     assert np.isnan(metrics["critic_loss"]).all() and (metrics["train_episodes"] == 40).all()
     actions = np.asarray(after.replay.storage[:, :40, 1])
@@ -86,7 +86,7 @@ def test_training_makes_one_update_per_transition(td3):
 def test_updates_per_step_and_num_envs_multiply():
     config, _, sweep = make("td3", num_envs=4, updates_per_step=3)
     state, _ = advance(sweep, start(config, sweep), 10, False)
-    assert state.env_steps == 40 and state.replay.size == 40
+    assert state.env_steps == 40 and state.replay.inserted == 40
     state, _ = advance(sweep, state, 5, True)
     assert state.env_steps == 60 and state.agent.gradient_steps == 5 * 4 * 3
 
@@ -94,13 +94,14 @@ def test_updates_per_step_and_num_envs_multiply():
 def test_diverged_physics_are_counted_and_never_reach_the_replay():
     config, _, sweep = make("td3", probe_envs.diverging)
     state, metrics = advance(sweep, start(config, sweep), 40, False)
-    rows = np.asarray(state.replay.storage[:, :40])  # obs, action, next_obs, reward, discount
+    rows = np.asarray(state.replay.storage[:, :40])  # obs, action, reward, discount, ...
     broken = rows[..., 1] > 0
     assert np.isfinite(rows).all() and broken.any(axis=1).all()
     np.testing.assert_array_equal(metrics["unstable_steps"], broken.sum(axis=1))
-    np.testing.assert_array_equal(rows[..., 4], ~broken)  # the episode terminated
-    np.testing.assert_array_equal(rows[..., 3], ~broken)  # with reward 0
-    np.testing.assert_array_equal(rows[..., 2], rows[..., 0])  # this task's state never changes
+    np.testing.assert_array_equal(rows[..., 3], ~broken)  # the episode terminated
+    np.testing.assert_array_equal(rows[..., 2], ~broken)  # with reward 0
+    last = np.asarray(state.replay.finals)[np.asarray(state.replay.owners) >= 0]
+    assert last.size and set(last.ravel()) <= set(rows[..., 0].ravel())  # this task's state never changes
     state, metrics = advance(sweep, state, 30, True)
     assert np.isfinite(metrics["critic_loss"]).all() and np.isfinite(state.replay.storage).all()
 
@@ -179,8 +180,8 @@ def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
     alone, _ = advance(sweep, alone, 40, False)
     together, _ = advance(sweep, together, 40, False)
     rows = alone.replay.storage[0], together.replay.storage[3]
-    assert np.array_equal(rows[0][:, :3], rows[1][:, :3])  # obs, action, next_obs
-    np.testing.assert_allclose(rows[0][:, 3:], rows[1][:, 3:], rtol=1e-4, atol=1e-6)
+    assert np.array_equal(rows[0][:, :2], rows[1][:, :2])  # obs, action
+    np.testing.assert_allclose(rows[0][:, 2:], rows[1][:, 2:], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("algo", ["td3_sqt", pytest.param("sac_sqt_tuple", marks=pytest.mark.slow)])
@@ -231,7 +232,7 @@ def test_evaluation_leaves_the_state_alone_and_draws_new_starts_each_time(td3):
 def test_the_compiled_text_writes_the_replay_in_place():
     config, _, sweep = make("td3", steps=100_000, replay_capacity=54_321)
     text = sweep.advance.lower(start(config, sweep), 1, True).compile().as_text()
-    shape = r"f32\[3,54321,5\]"
+    shape = r"f32\[3,54321,5\]"  # obs, action, reward, discount, where the final observation is
     made = [line for line in text.splitlines() if re.search(rf"= {shape}\S* (\w|-)+\(", line)]
     kinds = {re.search(rf"{shape}\S* ([\w-]+)\(", line).group(1) for line in made}
     assert "dynamic-update-slice" in kinds
@@ -278,7 +279,8 @@ def test_memory_estimate_is_the_size_of_what_is_held():
     state = start(config, sweep)
     agent = sum(leaf.nbytes for leaf in numbers(state.agent))
     estimate = algorithms.memory_estimate(config, 3, probe_envs.one_step())
-    assert estimate == pytest.approx(state.replay.storage.nbytes + 2 * agent, rel=0.01)
+    held = sum(leaf.nbytes for leaf in numbers(state.replay))
+    assert estimate == pytest.approx(held + 2 * agent, rel=0.01)
 
 
 def optimised(sweep, state):
@@ -339,10 +341,10 @@ def test_truncation_bootstraps_and_termination_does_not(algo):
 
 
 def test_an_environment_may_call_its_fields_as_it_likes():
-    """`size` is a counter that members share in the replay, and each member's own in an environment."""
-    config, _, sweep = make("td3", probe_envs.with_a_field_called_size)
+    """`inserted` is a counter that members share in the replay, and each member's own in an environment."""
+    config, _, sweep = make("td3", probe_envs.with_a_field_called_inserted)
     state, metrics = advance(sweep, start(config, sweep), 50, True)
-    assert state.timestep.state.task.size.shape == (3, 1) and (metrics["train_episodes"] > 0).all()
+    assert state.timestep.state.task.inserted.shape == (3, 1) and (metrics["train_episodes"] > 0).all()
 
 
 def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):

@@ -25,6 +25,7 @@ from sqt_jax.rarely import rarely
 from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
 
 LARGEST = 1e10  # MuJoCo's own limit (mjMAXVAL): beyond it, a simulation has diverged
+SHORTEST_FALL = 8  # steps, in the mean over many episodes, in which no robot that may fall manages to: see `Ring`
 
 Start = Callable[[Array], tuple[State, Array]]
 Advance = Callable[[State, Array], tuple[State, Array, Array, Array]]
@@ -48,6 +49,7 @@ def make_environment(
     start: Start,
     advance: Advance,
     place: Place | None = None,
+    shortest_episode: int = 1,
 ) -> Environment:
     """Make an `Environment` out of a task that knows nothing of episodes.
 
@@ -57,6 +59,7 @@ def make_environment(
       advance: `(state, action [A] in [-1, 1]) -> (state, obs [O], reward [], terminated [] bool)`, one step.
       place: `(qpos, qvel) -> (state, obs [O])`, a given physical state; gives `Environment.set_physics`, whose
         episodes to come start from a fixed key.
+      shortest_episode: as in `Environment`.
     """
 
     def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
@@ -103,4 +106,6 @@ def make_environment(
         return {"unstable_steps": timestep.state.unstable}
 
     given = set_physics if place else None
-    return Environment(name, observation_size, action_size, episode_length, reset, step, given, status)
+    return Environment(
+        name, observation_size, action_size, episode_length, reset, step, given, status, shortest_episode
+    )

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.envs.autoreset import SHORTEST_FALL, make_environment
 from sqt_jax.types import Array, Environment
 
 PREFIX = "brax:"
@@ -57,7 +57,8 @@ def make_brax(name: str, physics: str) -> Environment:
             state = _strong(env.step(state, action))
         return state, state.obs, state.reward, state.done > 0
 
-    return make_environment(name, env.observation_size, env.action_size, EPISODE_LENGTH, start, advance)
+    sizes = env.observation_size, env.action_size, EPISODE_LENGTH
+    return make_environment(name, *sizes, start, advance, shortest_episode=SHORTEST_FALL)
 
 
 def brax_own(name: str, physics: str) -> Any:

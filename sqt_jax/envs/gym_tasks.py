@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.envs.autoreset import SHORTEST_FALL, make_environment
 from sqt_jax.envs.gym_table import TASKS, Task
 from sqt_jax.envs.physics import Physics, PhysicsState, Setup, make_physics
 from sqt_jax.types import Array, Environment
@@ -107,4 +107,5 @@ def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:
         return state, observe(task, state), reward(task, state, control, control_step, terminated), terminated
 
     observation_size = jax.eval_shape(start, jax.random.key(0))[1].size
-    return make_environment(name, observation_size, model.nu, EPISODE_LENGTH, start, advance, place)
+    shortest = EPISODE_LENGTH if task.healthy is None else SHORTEST_FALL
+    return make_environment(name, observation_size, model.nu, EPISODE_LENGTH, start, advance, place, shortest)
