@@ -139,7 +139,7 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "temperature": (0, math.inf, "a number of at least 0"),
     "embedding_size": (1, 65536, "a whole number from 1 to 65536"),
     "target_update_period": (1, math.inf, "a whole number of at least 1"),
-    "priority_exponent": (0, math.inf, "a number of at least 0"),
+    "priority_exponent": (0, 1, "a number from 0 to 1"),
     "min_priority": (1e-6, math.inf, "a number of at least 0.000001"),
     "checkpoint_switch": (0, math.inf, "a whole number of at least 0"),
     "assessment_episodes": (1, math.inf, "a whole number of at least 1"),

@@ -83,7 +83,9 @@ class Agent(NamedTuple):
     # The policy whose values the critics estimate, where that is not the deterministic one: (state, obs [B, O], key) ->
     # action [B, A] and its entropy bonus [B].
     valued_act: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
-    observe: Callable[[State, Array, Array], State] = lambda state, episode_return, ended: state  # [E], [E] bool
+    # After each step of the environments: (state, returns of the running episodes [E], which of them ended [E] bool) ->
+    # state. TD7 assesses policies by it, and never acts otherwise than at the start without it.
+    observe: Callable[[State, Array, Array], State] = lambda state, episode_return, ended: state
     status: Callable[[State], Metrics] = lambda state: {}  # what is worth reporting of a state
 
 

@@ -38,6 +38,17 @@ def test_python_examples_run(code):
     exec(compile(code, "README.md", "exec"), {})
 
 
+@pytest.mark.slow
+def test_the_loop_of_ones_own_trains_td7_too():
+    (code,) = (code for code in PYTHON if "gymnasium.make" in code)
+    for shown, td7 in [('"td3_sqt"', '"td7_sqt"'), ("replay.uniform", "lap.lap"), ("import replay", "import lap")]:
+        assert code.count(shown) == 1
+        code = code.replace(shown, td7)
+    names: dict = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert names["state"].checkpoints.assessments == 1  # an episode has 200 steps
+
+
 @pytest.mark.parametrize("argv", COMMANDS, ids=lambda argv: " ".join(argv[1:3]))
 def test_commands_are_understood(argv, tmp_path):
     if any(word.startswith("--resume=") for word in argv):  # of a run that is not there

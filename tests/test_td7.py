@@ -261,6 +261,16 @@ def test_an_episodes_end_refreshes_the_snapshot_from_actor_and_fixed_encoder(thr
     assert same(after._replace(checkpoints=None), before._replace(checkpoints=None))
 
 
+def test_past_the_switch_of_gradient_steps_one_episode_does_not_end_an_assessment(three_policies):
+    late = three_policies._replace(gradient_steps=jnp.int32(SWITCH))
+    after = AGENT.observe(late, jnp.array([5.0]), jnp.array([True])).checkpoints
+    assert after.episodes == 1 and after.assessments == 0
+    assert same(after.snapshot, late.checkpoints.snapshot)
+    for _ in range(CONFIG.assessment_episodes):
+        late = AGENT.observe(late, jnp.array([5.0]), jnp.array([True]))
+    assert late.checkpoints.assessments == 1
+
+
 def test_the_status_tells_of_checkpoints_and_bounds(three_policies):
     status = AGENT.status(three_policies)
     assert status["assessments"] == status["checkpoint_refreshes"] == 0 and np.isnan(status["best_min_return"])
@@ -362,6 +372,19 @@ def test_the_replay_learns_its_priorities(trained):
     priorities = np.asarray(levels[0]).reshape(MEMBERS, -1)
     assert np.all(priorities[:, :filled] >= 1) and np.all(priorities[:, filled:] == 0)
     np.testing.assert_allclose(np.sum(levels[-1], axis=(1, 2)), priorities.sum(axis=1), rtol=1e-5)
+
+
+def test_training_refreshes_the_largest_priority_with_the_copies_of_the_targets(trained):
+    """One that no row has any more: rows that got it are drawn at once, and learn their own."""
+    state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(trained.final)  # training donates its state
+    steps = int(state.agent.gradient_steps)
+    assert steps % 4 == 0
+    state = state._replace(replay=state.replay._replace(max_priority=jnp.full(MEMBERS, 1000.0)))
+    state = trained.sweep.advance(state, 3, True)
+    assert np.all(state.replay.max_priority == 1000)
+    state = trained.sweep.advance(state, 5, True)
+    assert int(state.agent.gradient_steps) == steps + 8
+    assert np.all(state.replay.max_priority < 10)
 
 
 def test_the_train_loop_copies_neither_storage_nor_priorities(trained):
