@@ -1,8 +1,8 @@
 """How near our environments are to Gymnasium's: `python -m experiments.parity --out=parity.md`.
 
 For each task and version: whole episodes on MuJoCo C against Gymnasium's own environment, single control steps of each
-physics from the same states, and the speed of five environments side by side. The benchmark's flags --tasks,
---physics, --solver, --seconds and --repeats are understood.
+physics from the same states, starts and episodes in distribution, and the speed of five environments side by side.
+The benchmark's flags --tasks, --physics, --solver, --seconds and --repeats are understood.
 """
 
 import sys
@@ -17,6 +17,7 @@ from absl import app, flags, logging
 
 from experiments import runtime
 from experiments.bench import check_flags, machine, physics_here, solver_limits
+from experiments.distributions import Episodes, Starts, compare_play, compare_starts, play_table, start_table
 from experiments.gymnasium_reference import Episode, episode, recorded
 from experiments.measure import env_steps, measure_in_turns
 from sqt_jax import envs
@@ -25,6 +26,8 @@ from sqt_jax.types import Environment
 
 FLAGS = flags.FLAGS
 flags.DEFINE_integer("states", 256, "States from which a step is compared.", lower_bound=16)
+flags.DEFINE_integer("starts", 2_000, "Starts of episodes that are compared.", lower_bound=16)
+flags.DEFINE_integer("episodes", 60, "Episodes of a policy of random weights that are compared.", lower_bound=2)
 flags.DEFINE_string("out", "", "The report's file; it is printed in any case.")
 
 MEMBERS = 5  # environments side by side in the timing
@@ -128,7 +131,13 @@ def step_table(found: dict[tuple[str, str], tuple[Steps, float]]) -> list[str]:
     return lines
 
 
-def report(episodes: dict[str, WholeEpisodes], steps: dict[tuple[str, str], tuple[Steps, float]], command: str) -> str:
+def report(
+    episodes: dict[str, WholeEpisodes],
+    steps: dict[tuple[str, str], tuple[Steps, float]],
+    starts: dict[str, Starts],
+    played: dict[str, Episodes],
+    command: str,
+) -> str:
     about = ", ".join(f"{key}: {value}" for key, value in machine().items())
     return "\n".join(
         [
@@ -150,6 +159,21 @@ def report(episodes: dict[str, WholeEpisodes], steps: dict[tuple[str, str], tupl
             "",
             *step_table(steps),
             "",
+            "## Starts",
+            "",
+            "Positions and velocities in units of the task's noise, ours against Gymnasium's; the worst entry of each:",
+            "difference of the means, of the std (relative), of the ends of the range (of positions alone where",
+            "velocities are normal), and the p-value of a Kolmogorov-Smirnov test times the number of entries.",
+            "",
+            *start_table(starts),
+            "",
+            "## Episodes of one policy",
+            "",
+            "Random weights, from each side's own starts, ours on `mujoco`: mean length ± std, and p-values of",
+            "Kolmogorov-Smirnov tests.",
+            "",
+            *play_table(played),
+            "",
         ]
     )
 
@@ -170,16 +194,20 @@ def main(argv: Sequence[str]) -> None:
     rows = cases(physics_here())
     episodes: dict[str, WholeEpisodes] = {}
     steps: dict[tuple[str, str], tuple[Steps, float]] = {}
+    starts: dict[str, Starts] = {}
+    played: dict[str, Episodes] = {}
     for name in FLAGS.tasks:
         print(f"{name} ...", file=sys.stderr, flush=True)
         made = {row: envs.make(name, physics, **options) for row, (physics, options) in rows.items()}
         if "mujoco" in made:
             episodes[name] = compare_episodes(made["mujoco"], [episode(name, *case) for case in EPISODES])
+            played[name] = compare_play(name, made["mujoco"], FLAGS.episodes)
+        starts[name] = compare_starts(name, FLAGS.starts)
         runs = [env_steps(name, MEMBERS, physics, **options) for physics, options in rows.values()]
         rates = measure_in_turns(runs, FLAGS.seconds, FLAGS.repeats)
         for (row, env), (rate, _) in zip(made.items(), rates, strict=True):
             steps[name, row] = compare_steps(name, env, FLAGS.states), rate * MEMBERS
-    text = report(episodes, steps, " ".join(["python -m experiments.parity", *sys.argv[1:]]))
+    text = report(episodes, steps, starts, played, " ".join(["python -m experiments.parity", *sys.argv[1:]]))
     print(text)
     if FLAGS.out:
         Path(FLAGS.out).write_text(text)

@@ -48,15 +48,23 @@ def test_the_report_has_a_row_for_every_task_and_physics(tmp_path, capsys, monke
     parity.FLAGS.mark_as_parsed()
     out = tmp_path / "parity.md"
     with flagsaver.flagsaver(
-        tasks=["swimmer", "cheetah-v5"], physics=["mujoco"], states=16, seconds=0.0, repeats=1, out=str(out)
+        tasks=["hopper", "walker-v5"],
+        physics=["mujoco"],
+        states=16,
+        starts=16,
+        episodes=2,
+        seconds=0.0,
+        repeats=1,
+        out=str(out),
     ):
         monkeypatch.setattr(parity.sys, "argv", ["parity", "--states=16"])
         parity.main(["parity"])
     text = out.read_text()
     assert text in capsys.readouterr().out
-    assert text.count("| Swimmer-v4 |") == text.count("| HalfCheetah-v5 |") == 2
-    assert "| Swimmer-v4 | mujoco | " in text and "DIFFER" not in text
-    speed = text.split("| Swimmer-v4 | mujoco |")[1].split("\n")[0].split("|")[-2]
+    assert text.count("| Hopper-v4 |") == text.count("| Walker2d-v5 |") == 4
+    assert "| Hopper-v4 | mujoco | " in text and "DIFFER" not in text
+    assert "| Hopper-v4 | 16 | " in text and "| Walker2d-v5 | 2 | " in text
+    speed = text.split("| Hopper-v4 | mujoco |")[1].split("\n")[0].split("|")[-2]
     assert float(speed.replace(",", "")) > 0
     assert "`python -m experiments.parity --states=16`" in text
 
