@@ -1,4 +1,4 @@
-"""`tabulated.Table` as terminal output, markdown, CSV and LaTeX."""
+"""`table_parts.Table` as terminal output, markdown, CSV and LaTeX."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.tabulated import Cell, Table
+from experiments.table_parts import Cell, Table
 
 LATEX = {
     "\\": r"\textbackslash{}",

@@ -14,7 +14,7 @@ from experiments import figures
 from experiments.collected import Collected
 from experiments.markup import document, element, inline_svg
 from experiments.run_details import Command, Details
-from experiments.tabulated import NOTHING, Cell, Table
+from experiments.table_parts import NOTHING, Cell, Table
 
 FOLDER = Path(__file__).parent / "data" / "report"
 LONG = 45  # characters, from which on a cell may be wrapped

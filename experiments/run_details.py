@@ -11,7 +11,7 @@ import numpy as np
 from experiments import described, files
 from experiments.collected import Collected, Curves, setting_text
 from experiments.command_line import UsageError
-from experiments.tabulated import NOTHING, number
+from experiments.table_parts import NOTHING, number
 from sqt_jax.algorithms import make_config
 
 MAX_SUMMARY_BYTES = 10_000_000

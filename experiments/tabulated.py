@@ -5,78 +5,19 @@ else than the runs it stands for.
 """
 
 import functools
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from experiments import published, statistics
-from experiments.collected import (
-    PENALTY,
-    PROTOCOL,
-    Collected,
-    Group,
-    Row,
-    base_algorithm,
-    differing,
-    row_differences,
-    setting_text,
-)
+from experiments.collected import PROTOCOL, Collected, Group, Row, base_algorithm, row_differences, setting_text
 from experiments.published import Published
+from experiments.table_comparisons import forms_compared, has_penalty, versus_base
+from experiments.table_parts import NOTHING, Cell, Line, Notes, Table, finite, interval, joined, number
 
 NAMES = ("table1", "table2", "table2_improvement", "table3", "table3_change", "table4", "seeds")
 PAPERS_TASKS = ("cheetah", "walker", "ant", "humanoid")
-NOTHING = "-"
-
-
-class Cell(NamedTuple):
-    lines: tuple[str, ...]
-    marks: tuple[int, ...] = ()  # footnotes
-
-
-class Line(NamedTuple):
-    cells: list[Cell]
-    published: bool = False
-
-
-class Table(NamedTuple):
-    name: str  # of its files
-    title: str
-    header: list[str]
-    sections: list[list[Line]]
-    caption: str
-    notes: list[str]  # footnotes, the first is number 1
-    records: list[dict[str, Any]]  # the full numbers, a row of the CSV each
-
-
-class _Notes:
-    """Footnotes in the order in which they are first referred to."""
-
-    def __init__(self, texts: Iterable[str] = ()):
-        self.texts = list(texts)
-
-    def __call__(self, *texts: str) -> tuple[int, ...]:
-        for text in texts:
-            if text not in self.texts:
-                self.texts.append(text)
-        return tuple(sorted({self.texts.index(text) + 1 for text in texts}))
-
-
-class Comparison(NamedTuple):
-    """One group against another of the same task; `other` is None where there is none, and `note` says why."""
-
-    group: Group
-    other: Group | None
-    note: str = ""
-
-
-def number(value: float | None, sign: bool = False) -> str:
-    """`4,275`, `65.3` or `0.86`: three digits or all before the point."""
-    if value is None or not math.isfinite(value):
-        return NOTHING
-    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
-    return f"{value:{'+' if sign else ''},.{digits}f}"
 
 
 def spread(values: np.ndarray) -> dict[str, float | None]:
@@ -85,15 +26,15 @@ def spread(values: np.ndarray) -> dict[str, float | None]:
     found["iqm"] = float(statistics.iqm(values))
     for name, statistic in (("mean", statistics.mean), ("iqm", statistics.iqm)):
         low, high = statistics.bootstrap(statistic, values) if len(values) > 1 else (None, None)
-        found |= {f"{name}_low": _float(low), f"{name}_high": _float(high)}
+        found |= {f"{name}_low": finite(low), f"{name}_high": finite(high)}
     return found
 
 
 def make_tables(collected: Collected, reference: bool = False, sizes: Sequence[dict[str, Any]] = ()) -> list[Table]:
     """All tables that there is something for. `sizes`: what `task_sizes` gives."""
     tables = [table_1(sizes, reference), table_2(collected, reference)]
-    tables += [_versus_base(collected, reference, "table2_improvement"), table_3(collected, reference)]
-    tables += [_versus_base(collected, reference, "table3_change"), table_4(collected, reference)]
+    tables += [versus_base(collected, reference, "table2_improvement"), table_3(collected, reference)]
+    tables += [versus_base(collected, reference, "table3_change"), table_4(collected, reference)]
     tables += [seeds_table(collected)]
     return [table for table in tables if any(table.sections)]
 
@@ -154,7 +95,7 @@ def table_3(collected: Collected, reference: bool) -> Table:
 
 def table_4(collected: Collected, reference: bool) -> Table:
     """SQT and SQT-tuple, their scores and how they compare."""
-    both = [row for row in collected.rows if _has_penalty(row)]
+    both = [row for row in collected.rows if has_penalty(row)]
     families = {base_algorithm(row.algo) for row in both if row.algo.endswith("_tuple")}
     rows = [row for row in both if base_algorithm(row.algo) in families]
     caption = (
@@ -166,34 +107,15 @@ def table_4(collected: Collected, reference: bool) -> Table:
     figures = [figure for figure in figures if figure.algo in keep]  # not of their bases
     title = "Table 4: the batch's mean std (sqt) and each transition's (sqt_tuple)"
     table = _algorithms(("table4", title, caption), collected, rows, _score_cell, "score", figures)
-    notes = _Notes(table.notes)
-    lines = []
-    for row in rows:
-        for other in rows:
-            if other.algo != f"{row.algo}_tuple":
-                continue
-            pairs = {}
-            for task, group in row.groups.items():
-                found = [g for g in collected.counterparts(group, other.algo) if g is other.groups.get(task)]
-                if found:
-                    pairs[task] = Comparison(group, found[0])
-                elif task in other.groups:
-                    why = differing(group, other.groups[task], PENALTY)
-                    pairs[task] = Comparison(group, None, f"not compared: {why}")
-            label = f"{row.label} against {other.label}"
-            line, records = _compared(label, pairs, collected.tasks, lambda group: group.scores, notes)
-            # The last two cells are over tasks, for which there are no columns here: beneath the label instead.
-            over_tasks = [cell for cell in line.cells[-2:] if cell.lines != (NOTHING,)]
-            words = [f"over tasks: {' '.join(cell.lines)}" for cell in over_tasks] if len(collected.tasks) > 1 else []
-            line.cells[0] = Cell((label, *words))
-            lines.append(Line([*line.cells[:-2], *(Cell(("",)) for _ in range(3))]))
-            table.records.extend(records)
+    notes = Notes(table.notes)
+    lines, records = forms_compared(rows, collected, notes)
+    table.records.extend(records)
     return table._replace(sections=[*table.sections, lines] if lines else table.sections, notes=notes.texts)
 
 
 def seeds_table(collected: Collected) -> Table:
     """What each seed reached."""
-    notes = _Notes()
+    notes = Notes()
     lines, records = [], []
     for row in collected.rows:
         for task, group in row.groups.items():
@@ -235,7 +157,7 @@ def _algorithms(
     figures: Sequence[Published],
 ) -> Table:
     """Algorithms × tasks, each algorithm's published figures beneath it."""
-    notes = _Notes()
+    notes = Notes()
     most = max((len(group.seeds) for group in collected.groups), default=0)
     sections, records = [], []
     shown = dict.fromkeys(row.algo for row in rows)
@@ -256,7 +178,8 @@ def _algorithms(
                     why.append(f"fewer seeds than other cells, which have {most}")
                 cells.append(Cell(text, notes(*why)))
                 records.append(_record(row, group, quantity, numbers, why))
-            coefs = dict.fromkeys(g.settings["penalty_coef"] for g in row.groups.values() if _penalised(g))
+            penalised = [g for g in row.groups.values() if g.settings["penalty"] != "none"]
+            coefs = dict.fromkeys(group.settings["penalty_coef"] for group in penalised)
             cells.append(Cell((" / ".join(map(setting_text, coefs)) or NOTHING,)))
             for name in ("steps", "updates_per_step"):
                 values = dict.fromkeys(group.settings[name] for group in row.groups.values())
@@ -280,7 +203,7 @@ def _score_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str
         return (NOTHING,), {}, ["no evaluation that all its seeds have"]
     found = spread(group.scores)
     final = {f"final_{name}": value for name, value in spread(group.finals).items()}
-    numbers = found | {"score_env_steps": group.scored_at, "per_seed": _joined(group.scores)} | final
+    numbers = found | {"score_env_steps": group.scored_at, "per_seed": joined(group.scores)} | final
     return _spread_lines(found, len(group.seeds)), numbers, []
 
 
@@ -289,14 +212,14 @@ def _q_std_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str
     if values is None:
         return (NOTHING,), {}, ["no interval in which all its seeds measured q_std"]
     found = spread(values)
-    lines, numbers = _spread_lines(found, len(group.seeds)), found | {"per_seed": _joined(values)}
+    lines, numbers = _spread_lines(found, len(group.seeds)), found | {"per_seed": joined(values)}
     if bias is not None:
         lines = (*lines, f"bias {number(bias.mean(), sign=True)} ± {number(bias.std())}")
     for column in group.columns("value_bias"):
         measured = group.mean_of(column)
         if measured is not None:
             numbers |= {f"{column}_{name}": value for name, value in spread(measured).items()}
-            numbers |= {f"{column}_per_seed": _joined(measured)}
+            numbers |= {f"{column}_per_seed": joined(measured)}
     return lines, numbers, []
 
 
@@ -304,130 +227,10 @@ def _spread_lines(found: Mapping[str, float | None], seeds: int) -> tuple[str, .
     first = f"{number(found['mean'])} ± {number(found['std'])} ({seeds})"
     if found["iqm_low"] is None:
         return (first,)
-    return first, f"{number(found['iqm'])} {_interval(found['iqm_low'], found['iqm_high'])}"
+    return first, f"{number(found['iqm'])} {interval(found['iqm_low'], found['iqm_high'])}"
 
 
-def _versus_base(collected: Collected, reference: bool, name: str) -> Table:
-    """Each algorithm with a penalty against its base: the score (table 2), or the disagreement (table 3)."""
-    score = name == "table2_improvement"
-    what = "score" if score else "std_T"
-    values_of: Callable[[Group], np.ndarray | None] = (
-        (lambda group: group.scores) if score else lambda group: group.mean_of("q_std")
-    )
-    notes = _Notes()
-    lines, records = [], []
-    for row in collected.rows:
-        if not _has_penalty(row):
-            continue
-        pairs = {}
-        for task, group in row.groups.items():
-            base = collected.base(group)
-            pairs[task] = Comparison(group, base.group, base.note)
-        line, found = _compared(
-            f"{row.label} against {base_algorithm(row.algo)}", pairs, collected.tasks, values_of, notes
-        )
-        lines.append(line)
-        records += found
-    if reference and lines:
-        numbers = published.paper()
-        if score:
-            quoted = {f"{algo}_sqt": v for algo, v in numbers["table2_improvement_percent_mean_over_tasks"].items()}
-            shown = {row.algo for row in collected.rows}
-            quoted = {f"{algo} against {base_algorithm(algo)}": v for algo, v in quoted.items() if algo in shown}
-        else:
-            quoted = {"with SQT against without": numbers["table3_q_std"]["mean_improvement_percent"]}
-        for label, value in quoted.items():
-            cells = [Cell((f"published: {label}", f"{published.PAPER}; 1,000,000 steps, its four tasks"))]
-            cells += [Cell(("",)) for _ in collected.tasks]
-            lines.append(Line([*cells, Cell((f"{number(value, sign=True)} %",)), Cell((NOTHING,))], published=True))
-            over_tasks = {"env": "mean over tasks", "improvement_percent": value, "source": published.PAPER}
-            records.append({"comparison": label} | over_tasks)
-    many = f"by how many per cent the mean {what} of the seeds exceeds the base's"
-    caption = f"Per task: {many}, and P, the probability that a seed exceeds a seed of the base (a tie counts a half)."
-    title = "Table 2, SQT against its base: score" if score else "Table 3, SQT against its base: std_T"
-    header = ["comparison", *collected.tasks, "mean over tasks", "P over tasks"]
-    if len(collected.tasks) == 1 and not any(line.published for line in lines):
-        header, lines = header[:-2], [Line(line.cells[:-2]) for line in lines]
-    else:
-        caption += " The last columns: the means of these over the tasks compared."
-    caption += " In brackets: 95 % intervals by stratified bootstrap, tasks and algorithms being the strata."
-    return Table(name, title, header, [lines] if lines else [], caption, notes.texts, records)
-
-
-def _compared(
-    label: str,
-    pairs: Mapping[str, Comparison],
-    tasks: Sequence[str],
-    values_of: Callable[[Group], np.ndarray | None],
-    notes: _Notes,
-) -> tuple[Line, list[dict[str, Any]]]:
-    """A line of comparisons, its last two cells over all tasks that can be compared, and the full numbers."""
-    cells, records, strata, all_marks = [Cell((label,))], [], [], set()
-    for task in tasks:
-        if task not in pairs:
-            cells.append(Cell((NOTHING,), notes("no such run")))
-            continue
-        group, other, note = pairs[task]
-        why = [note] if note else []
-        x, y = values_of(group), values_of(other) if other else None
-        if other is not None:
-            why += [f"{one.algo} on {task}: {note}" for one in (group, other) for note in one.notes]
-        if x is None or y is None or other is None:
-            cells.append(Cell((NOTHING,), notes(*(why or ["nothing measured that could be compared"]))))
-            continue
-        found = _against(x, y)
-        why += _percentage_notes(found)
-        marks = notes(*why)
-        all_marks |= set(marks)
-        strata += [x, y]
-        cells.append(Cell(_against_lines(found), marks))
-        records.append(
-            {"comparison": label, "env": task}
-            | found
-            | {"seeds": _joined(group.seeds), "other_seeds": _joined(other.seeds), "notes": "; ".join(why)}
-        )
-    if not strata:
-        return Line([*cells, Cell((NOTHING,)), Cell((NOTHING,))]), records
-    found = _against(*strata)
-    lines = _against_lines(found)
-    missing = len(strata) // 2 < len(tasks)
-    why = _percentage_notes(found) + (["not over all tasks"] if missing else [])
-    marks = tuple(sorted(all_marks | set(notes(*why))))
-    cells += [Cell((lines[0],), marks), Cell((lines[1],), marks)]
-    over = {"comparison": label, "env": "mean over tasks"} | found
-    return Line(cells), [*records, over | {"notes": "; ".join(notes.texts[mark - 1] for mark in marks)}]
-
-
-def _against(*strata: np.ndarray) -> dict[str, float | None]:
-    statistic = {"improvement": statistics.improvement, "probability": statistics.probability_of_improvement}
-    found: dict[str, float | None] = {}
-    for name, function in statistic.items():
-        key = "improvement_percent" if name == "improvement" else "probability_of_improvement"
-        single = all(len(stratum) == 1 for stratum in strata)
-        low, high = (None, None) if single else statistics.bootstrap(function, *strata)
-        found |= {key: _float(function(*strata)), f"{name}_low": _float(low), f"{name}_high": _float(high)}
-    return found
-
-
-def _percentage_notes(found: Mapping[str, float | None]) -> list[str]:
-    """Why there is no percentage, or no interval of it."""
-    if found["improvement_percent"] is None:
-        return ["no percentage: the other mean is not positive"]
-    if found["improvement_low"] is None and found["probability_low"] is not None:
-        return ["no interval of the percentage: the other mean is not positive in some resamples"]
-    return []
-
-
-def _against_lines(found: Mapping[str, float | None]) -> tuple[str, str]:
-    value = found["improvement_percent"]
-    percent = NOTHING
-    if value is not None:
-        percent = f"{number(value, sign=True)} % {_interval(found['improvement_low'], found['improvement_high'])}"
-    chance = f"P {number(found['probability_of_improvement'])} "
-    return percent.strip(), (chance + _interval(found["probability_low"], found["probability_high"])).strip()
-
-
-def _published_lines(figures: Sequence[Published], tasks: Sequence[str], notes: _Notes) -> list[Line]:
+def _published_lines(figures: Sequence[Published], tasks: Sequence[str], notes: Notes) -> list[Line]:
     """A line per source, its figures in the columns of their tasks."""
     sources: dict[tuple[str, ...], dict[str, Published]] = {}
     for figure in figures:
@@ -459,7 +262,7 @@ def _published_record(figure: Published, quantity: str) -> dict[str, Any]:
 def _record(row: Row, group: Group, quantity: str, numbers: Mapping[str, Any], why: Sequence[str]) -> dict[str, Any]:
     settings = {name: group.settings[name] for name in ("penalty_coef", *PROTOCOL)}
     where = {"algo": row.algo, "row": row.label, "env": group.env, "quantity": quantity}
-    return where | dict(numbers) | {"seeds": _joined(group.seeds)} | settings | {"source": "", "notes": "; ".join(why)}
+    return where | dict(numbers) | {"seeds": joined(group.seeds)} | settings | {"source": "", "notes": "; ".join(why)}
 
 
 def _row_notes(row: Row) -> list[str]:
@@ -487,26 +290,6 @@ def _protocol_notes(rows: Sequence[Row]) -> list[str]:
             rest = "; ".join(f"{setting_text(value)} for {', '.join(where)}" for value, where in ranked[1:])
             differing.append(f"Not everywhere the same: {name} is {setting_text(ranked[0][0])}, but {rest}.")
     return ([f"Common to all: {', '.join(common)}."] if common else []) + differing
-
-
-def _has_penalty(row: Row) -> bool:
-    return any(_penalised(group) and group.settings["penalty_coef"] > 0 for group in row.groups.values())
-
-
-def _penalised(group: Group) -> bool:
-    return group.settings["penalty"] != "none"
-
-
-def _interval(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f"[{number(low)}, {number(high)}]"
-
-
-def _joined(values: Iterable[Any]) -> str:
-    return " ".join(f"{value:.10g}" for value in values)
-
-
-def _float(value: Any) -> float | None:
-    return float(value) if value is not None and np.isfinite(value) else None
 
 
 def _sentence(text: str) -> str:

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from experiments.formats import FORMATS, comma_separated, latex, markdown, rich_table, terminal
-from experiments.tabulated import Cell, Line, Table
+from experiments.table_parts import Cell, Line, Table
 
 TABLE = Table(
     "table2",

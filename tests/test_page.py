@@ -7,7 +7,7 @@ from made_runs import write_run
 from experiments import figures, run_details, tabulated
 from experiments.collected import collect
 from experiments.page import Content, page, sort_key
-from experiments.tabulated import Cell
+from experiments.table_parts import Cell
 
 
 def content_of(folder, reference=False):
