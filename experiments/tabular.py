@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from experiments import contraction, mdps, runtime, tabular_agents
+from experiments import contraction, mdps, runtime, tabular_agents, tabular_figure
 from experiments import tabular_report as report
 from experiments.flags import ABSL_FLAGS, UsageError
 from experiments.progress import format_seconds
@@ -280,7 +280,7 @@ def measure(flag: dict[str, Any], out: Path, argv: Sequence[str]) -> int:
     command = shlex.join(["python", "-m", "experiments.tabular", *argv[1:]])
     text = report.markdown(command, settings_of(flag), table, found, expansion)
     (out / "table.md").write_text(text, encoding="utf-8")
-    report.draw(results, out / "tabular.png")
+    tabular_figure.draw(results, out / "tabular.png")
     console.print(f"\n{out / 'table.md'}, {out / 'tabular.png'}", soft_wrap=True, highlight=False, markup=False)
     return DONE
 

@@ -1,80 +1,10 @@
-"""The command from end to end, and that its statements follow from the numbers they are given."""
+"""The command from end to end."""
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from experiments import tabular, tabular_agents
-from experiments import tabular_report as report
-
-STEPS = np.array([100, 1000, 10_000])
-
-
-def curves(coefs=(None,), tables=1, bias=0.1, error=(3.0, 2.0, 1.0), std=0.0, ratio=0.5, seeds=4):
-    """Made up: a number or one per checkpoint for each quantity; seeds differ by a little."""
-    spread = 1 + 0.01 * np.arange(seeds)[:, None, None]
-    shape = (seeds, len(coefs), len(STEPS))
-
-    def filled(value):
-        return np.broadcast_to(np.asarray(value, float), shape) * spread
-
-    record = report.Record(filled(error), filled(error), filled(bias), filled(std), filled(ratio))
-    return report.Curves(tuple(coefs), STEPS, record, np.ones((seeds, len(coefs), tables, 2, 2)))
-
-
-def test_a_verdict_needs_all_rows_and_their_intervals():
-    assert report.verdict_of([(1.0, 0.5), (0.6, 0.5)], +1) == "supported"
-    assert report.verdict_of([(1.0, 0.5), (0.4, 0.5)], +1) == "not shown"
-    assert report.verdict_of([(1.0, 0.5), (-0.6, 0.5)], +1) == "contradicted"
-    assert report.verdict_of([(-0.6, 0.5)], -1) == "supported"
-    assert report.verdict_of([(1.0, np.nan)], +1) == report.verdict_of([], +1) == "not shown"
-
-
-def test_the_interval_is_students():
-    # mean 2, std 1, four seeds: 3.182 / 2
-    mean, width = report.interval(np.array([1.0, 1.0, 3.0, 3.0]) * 3**0.5 / 2)
-    assert mean == pytest.approx(3**0.5) and width == pytest.approx(3.182446 / 2, rel=1e-5)
-
-
-def test_statements_follow_from_the_numbers():
-    sqt = np.array([[-0.1], [-0.2]]) * np.ones(3)
-    good = {
-        ("grid", "q_learning"): curves(bias=0.3),
-        ("grid", "maxmin"): curves(tables=2, bias=-0.1, std=(3, 2, 1)),
-        ("grid", "sqt"): curves((0.0, 0.5), 2, bias=sqt, std=(3, 2, 1)),
-        ("grid", "sqt_shared"): curves((0.0, 0.5), 2, bias=0.3),
-    }
-    checks = {
-        report.overestimation: {("grid", "q_learning"): curves(bias=-0.3)},
-        report.underestimation: {("grid", "maxmin"): curves(tables=2, bias=0.1)},
-        report.monotone: {("grid", "sqt"): curves((0.0, 0.5), 2, bias=-sqt)},
-        report.convergence: {("grid", "maxmin"): curves(tables=2, error=(1, 2, 3))},
-        report.penalty: {("grid", "sqt"): curves((0.0, 0.5), 2, std=(1, 2, 3))},
-        report.identical: {("grid", "sqt_shared"): curves((0.0, 0.5), 2, std=1.0)},
-        report.on_the_way: {("grid", "sqt"): curves((0.0, 0.5), 2, ratio=(0.5, 1.5, 0.5))},
-    }
-    for statement, bad in checks.items():
-        assert statement(good).verdict == "supported", statement
-        assert statement(good | bad).verdict == "contradicted", statement
-        assert statement({}).verdict == "not shown" and "not run" in statement({}).evidence, statement
-    other = report.underestimation(good | checks[report.underestimation])
-    assert other.evidence.endswith("The other way: grid, maxmin.")
-
-
-def test_eq_16_is_contradicted_by_a_penalty_only():
-    sqt = tabular_agents.algorithms()["sqt"]
-    for coef, verdict in ((0.0, "supported"), (0.5, "contradicted")):
-        found = report.expansions(sqt, [coef], 1, 2000)
-        statement = report.non_expansion(found, 4, 0.8, 1, 2000)
-        assert statement.verdict == verdict
-        assert f"{found[0].given:.4f}" in statement.evidence
-        assert ("|T Q - T Q'| = 3/2 gamma" in statement.evidence) == (coef == 0.5)
-
-
-def test_rows_that_are_all_alike_are_one():
-    found = report.cells({("grid", "sqt_shared"): curves((0.0, 0.5), 2), ("grid", "q_learning"): curves()})
-    assert [row[:3] for row in found] == [("grid", "sqt_shared", "all alike"), ("grid", "q_learning", "-")]
-    assert all(len(row) == len(report.HEADER) for row in found)
+from experiments import tabular
 
 
 def test_the_command_from_end_to_end(tmp_path, capsys):
