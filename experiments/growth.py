@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-from experiments.figures import ALGORITHM_COLOURS, COLOURS, MARKERS
+from experiments.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
 from experiments.measure import REPLAYS, Row, bench_replay, bench_updates
 
 MEMBERS = (1, 2, 5, 10, 25, 50)

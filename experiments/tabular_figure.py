@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from experiments import mdps
-from experiments.figures import COLOURS
+from experiments.figure_style import COLOURS
 from experiments.tabular_report import Curves, Names, collapsed, interval
 
 STYLES = {  # colour, line, label

@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
+from figure_reader import legend_of, panels, pixels_of
 from made_runs import write_run
-from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from experiments import figures
 from experiments.collected import collect
-from experiments.figures import ALGORITHM_COLOURS, COLOURS, FORM_LINES, draw_curves, over_time, penalty_sweep
+from experiments.figure_style import ALGORITHM_COLOURS, COLOURS
+from experiments.figures import draw_curves, over_time, penalty_sweep
 from experiments.records import EVALUATION_COLUMNS
-from sqt_jax.algorithms import ALGORITHMS
 
 NAN = float("nan")
 
@@ -27,25 +27,8 @@ def table_of(curves, coefs, q_std=1.0):
     return table
 
 
-def pixels_of(image, colour):
-    return int((np.abs(image[..., :3] - to_rgb(colour)).max(axis=-1) < 0.02).sum())
-
-
-def panels(figure):
-    return [axes for axes in figure.axes if axes.get_visible()]
-
-
 def lines_of(axes, colour):
     return [line.get_xydata() for line in axes.lines if line.get_color() == colour]
-
-
-def legend_of(figure):
-    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
-    return [text.get_text() for legend in legends for text in legend.get_texts()]
-
-
-def luminance(colour):
-    return np.dot(to_rgb(colour), [0.2126, 0.7152, 0.0722])
 
 
 def test_each_group_is_drawn_in_its_own_colour(tmp_path):
@@ -67,30 +50,6 @@ def test_a_member_that_is_an_evaluation_short_is_drawn(tmp_path):
     table = table_of([[0, 1, 2], [1, 2, 3]], [0.1, 0.1])
     draw_curves({name: column[:-1] for name, column in table.items()}, tmp_path / "curves.png", "td3 on ant")
     assert pixels_of(imread(tmp_path / "curves.png"), COLOURS[0]) > 500
-
-
-def test_every_algorithm_has_a_colour_and_a_line_of_its_own():
-    assert {*ALGORITHM_COLOURS} == {*ALGORITHMS}
-    assert len({*ALGORITHM_COLOURS.values()}) == len(ALGORITHM_COLOURS)
-    for base in ("td3", "sac", "td7"):  # in grey, a form is lighter than its base
-        shades = [luminance(ALGORITHM_COLOURS[base + form]) for form in FORM_LINES]
-        assert shades == sorted(shades) and np.diff(shades).min() > 0.08
-
-
-def test_a_row_has_the_same_style_whatever_stands_beside_it(tmp_path):
-    write_run(tmp_path / "a", "sac_sqt")
-    write_run(tmp_path / "b", "td3")
-    both, one = collect([str(tmp_path)]), collect([str(tmp_path / "a")])
-    style = figures.styles(both.rows)["sac_sqt"]
-    assert figures.styles(one.rows)["sac_sqt"] == style
-    assert style == (ALGORITHM_COLOURS["sac_sqt"], FORM_LINES["_sqt"], "")
-
-
-def test_coefficients_of_an_algorithm_are_shades_with_markers(tmp_path):
-    write_run(tmp_path, "td3_sqt", curves=[[0, 1]] * 3, swept={"penalty_coef": (0.1, 0.5, 1.0)})
-    found = list(figures.styles(collect([str(tmp_path)]).rows).values())
-    shades = [luminance(style.colour) for style in found]
-    assert shades == sorted(shades, reverse=True) and len({style.marker for style in found}) == 3
 
 
 @pytest.mark.parametrize(("statistic", "middle"), [("iqm", [0, 2, 4]), ("mean", [0, 4, 4.4])])
@@ -117,28 +76,6 @@ def test_a_seed_alone_has_no_band_and_a_diverged_one_ends_the_line(tmp_path):
     assert line[:, 0].tolist() == [0, 50]
     assert legend_of(figure) == ["td3", "sac *"]
     assert "* sac on cheetah: seed 1 diverged after step 50" in figure.get_supxlabel()
-
-
-def test_few_algorithms_share_a_panel_per_task_and_many_have_one_per_family(tmp_path):
-    algos = [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))]
-    for algo in algos:
-        for env in ("cheetah", "ant"):
-            write_run(tmp_path / base(algo), algo, env)
-    many = over_time(collect([str(tmp_path)]), "return_mean", "iqm")
-    assert len(panels(many)) == 6 and sorted(legend_of(many)) == sorted(algos)
-    few = over_time(collect([str(tmp_path / "td3"), str(tmp_path / "sac")]), "return_mean", "iqm")
-    assert [axes.get_title() for axes in panels(few)] == ["cheetah", "ant"] and len(legend_of(few)) == 6
-
-
-def base(algo):
-    return algo.partition("_")[0]
-
-
-def test_many_tasks_go_on_in_the_next_row(tmp_path):
-    for env in ("cheetah", "walker", "ant", "humanoid", "hopper"):
-        write_run(tmp_path, env=env)
-    figure = over_time(collect([str(tmp_path)]), "return_mean", "iqm")
-    assert [axes.get_title() for axes in panels(figure)] == ["cheetah", "walker", "ant", "humanoid", "hopper"]
 
 
 def test_what_was_not_measured_has_no_figure(tmp_path):
