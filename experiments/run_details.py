@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import described, files
-from experiments.collected import Collected, Curves, setting_text
+from experiments.collected import Collected, setting_text
 from experiments.command_line import UsageError
+from experiments.finished_runs import Curves
 from experiments.table_parts import NOTHING, number
 from sqt_jax.algorithms import make_config
 
