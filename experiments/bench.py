@@ -211,7 +211,7 @@ def main(argv: Sequence[str]) -> None:
         found.append(row)
         console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
         if row.kinds:
-            console.print(f"  {kernels.told(row.kinds)}", highlight=False)
+            console.print(f"  {kernels.told(row.kinds, row.members / row.rate)}", highlight=False)
     peak = 0.0
     if any(row.operations for row in found):
         peak = operations.peak(seconds=FLAGS.seconds, repeats=FLAGS.repeats)
