@@ -22,8 +22,8 @@ class Kind(NamedTuple):
     """Operations of one name but for its number, as XLA calls them (`dot`, `add_convert_fusion`)."""
 
     name: str
-    number: float  # a step
-    seconds: float  # a step, of all devices together, under the profiler
+    number: float  # a step, of all devices together
+    seconds: float  # likewise, under the profiler
 
 
 def profile(run: Callable[[int], Any], steps: int) -> list[Kind]:
