@@ -175,8 +175,8 @@ def parts(
             for algo, task in itertools.product(algos, tasks):
                 loops = bench_loops(algo, task, count, physics, devices, FLAGS.profile, **timing)
                 yield f"loop: {algo} on {task}", loops
-        elif suite == "growth":
-            yield "growth", growth.rows(algos, tasks[0], count, **timing)
+    if "growth" in suites:
+        yield "growth", growth.rows(algos, tasks[0], members[0], **timing)
     for peer, count, algo, task in itertools.product(FLAGS.compare, members, algos, tasks):
         if algo in compare.ALGORITHMS[peer]:
             both = compare.compare(peer, algo, task, count, physics, FLAGS.peer_python, environment, **timing)
