@@ -7,6 +7,9 @@ Operations are those of the matrix products, and their peak is measured in the s
 Each figure is the median over `--repeats` timed calls of a compiled loop that runs for about `--seconds`, after a
 first call that compiles. The suites of one process run one after the other; compare figures of one run only, since a
 machine's speed changes with what else it does.
+
+What fails is told in a line that begins with `failed`, and the rest is measured; the exit code is 1 then. `--json` is
+written anew with every row.
 """
 
 import dataclasses
@@ -24,15 +27,17 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compare, growth, kernels, operations, runtime
+from experiments import compare, files, growth, kernels, operations, runtime
 from experiments.measure import (
     REPLAYS,
+    Failure,
     Row,
     bench_env,
     bench_loops,
     bench_physics,
     bench_replay,
     bench_updates,
+    why,
 )
 from experiments.measure_checkpoints import bench_checkpoint
 from sqt_jax import algorithms, envs
@@ -46,6 +51,7 @@ NAMED: dict[str, dict[str, Any]] = {
         "algos": ["td3", "td7"],
         "tasks": ["ant", "humanoid"],
         "members": ["5", "64", "512"],
+        "devices": ["1", "all"],
         "profile": True,
     },
     "growth": {"suites": ["growth"], "tasks": ["cheetah"], "members": ["5"]},
@@ -59,7 +65,9 @@ flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itsel
 flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
-flags.DEFINE_list("devices", ["1"], "Numbers of devices that the suites update and loop spread their members over.")
+flags.DEFINE_list(
+    "devices", ["1"], "Devices that the suites update and loop spread their members over: numbers, or all."
+)
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
 flags.DEFINE_boolean("profile", False, "Also count and time what the suite loop runs on the device.")
 flags.DEFINE_string("figures", "bench", "Folder of the suite growth's figures.")
@@ -88,10 +96,16 @@ def check_flags() -> None:
                 sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
     for name in ("members", "devices", "capacities"):
         for value in getattr(FLAGS, name):
-            if not value.isdecimal() or int(value) < 1:
+            if not (value.isdecimal() and int(value)) and (name, value) != ("devices", "all"):
                 sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
     solver_limits()
+    if "growth" in FLAGS.suites and len(FLAGS.members) != 1:
+        sys.exit(f"--members: takes one number where growth is measured, not {','.join(FLAGS.members)}")
+    if FLAGS.json and (Path(FLAGS.json).is_dir() or not Path(FLAGS.json).absolute().parent.is_dir()):
+        sys.exit(f"--json: takes a file in a folder that is there, not {FLAGS.json!r}")
     for peer in FLAGS.compare:
+        if not {*compare.ALGORITHMS[peer]} & {*FLAGS.algos}:
+            sys.exit(f"--algos: takes some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
         if compare.lacks(peer, FLAGS.peer_python):
             sys.exit(f"--compare: {peer} needs a Python with {compare.INSTALL[peer]}; --peer_python names it")
 
@@ -115,38 +129,58 @@ def physics_here() -> list[str]:
     return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
 
 
-def rows(suites: Sequence[str], physics: Sequence[str], environment: Mapping[str, str], **timing: Any) -> Iterator[Row]:
+def devices_here() -> list[int]:
+    """--devices, `all` as how many there are; leaves with one line where one is more."""
+    here = len(jax.local_devices())
+    counts = [here if value == "all" else int(value) for value in FLAGS.devices]
+    if max(counts) > here:
+        sys.exit(f"--devices: takes at most {here} here, not {max(counts)}")
+    return list(dict.fromkeys(counts))
+
+
+def rows(
+    suites: Sequence[str], physics: Sequence[str], environment: Mapping[str, str], **timing: Any
+) -> Iterator[Row | Failure]:
     """What the flags ask for; `environment` is that of the peers' processes."""
-    tasks, algos = FLAGS.tasks, FLAGS.algos
-    members, devices = ([int(value) for value in getattr(FLAGS, name)] for name in ("members", "devices"))
-    for suite in suites:
-        for count in members:
-            if suite == "env":
-                yield from (bench_env(task, count, name, **timing) for task in tasks for name in physics)
-            elif suite == "physics":
-                for task in tasks:
-                    yield from bench_physics(task, count, solver_limits(), **timing)
-            elif suite == "update":
-                for algo, task in itertools.product(algos, tasks):
-                    yield from bench_updates(algo, task, count, devices, **timing)
-            elif suite == "replay":
-                yield from (
-                    bench_replay(kind, what, tasks[0], int(size), count, **timing)
-                    for kind in REPLAYS
-                    for what in ("insert", "sample")
-                    for size in FLAGS.capacities
-                )
-            elif suite == "checkpoint":
-                for algo, task in itertools.product(algos, tasks):
-                    yield from bench_checkpoint(algo, task, count, timing["repeats"])
-            elif suite == "loop":
-                for algo, task in itertools.product(algos, tasks):
-                    yield from bench_loops(algo, task, count, physics, devices, FLAGS.profile, **timing)
-            elif suite == "growth":
-                yield from growth.rows(algos, tasks[0], count, **timing)
+    for what, found in parts(suites, physics, environment, **timing):
+        try:
+            yield from found
+        except Exception as error:
+            yield Failure(what, why(error))
+
+
+def parts(
+    suites: Sequence[str], physics: Sequence[str], environment: Mapping[str, str], **timing: Any
+) -> Iterator[tuple[str, Iterator[Row | Failure]]]:
+    """The measurements, each of which goes on when another fails, and what to call them then."""
+    tasks, algos, devices = FLAGS.tasks, FLAGS.algos, devices_here()
+    members = [int(value) for value in FLAGS.members]
+    for suite, count in itertools.product(suites, members):
+        if suite == "env":
+            for task, name in itertools.product(tasks, physics):
+                yield f"env: {task}, {name}", bench_env(task, count, name, **timing)
+        elif suite == "physics":
+            for task in tasks:
+                yield f"physics: {task}", bench_physics(task, count, solver_limits(), **timing)
+        elif suite == "update":
+            for algo, task in itertools.product(algos, tasks):
+                yield f"update: {algo}, {task}", bench_updates(algo, task, count, devices, **timing)
+        elif suite == "replay":
+            for kind, what, size in itertools.product(REPLAYS, ("insert", "sample"), map(int, FLAGS.capacities)):
+                yield f"replay: {kind} {what}", bench_replay(kind, what, tasks[0], size, count, **timing)
+        elif suite == "checkpoint":
+            for algo, task in itertools.product(algos, tasks):
+                yield f"checkpoint: {algo}, {task}", bench_checkpoint(algo, task, count, timing["repeats"])
+        elif suite == "loop":
+            for algo, task in itertools.product(algos, tasks):
+                loops = bench_loops(algo, task, count, physics, devices, FLAGS.profile, **timing)
+                yield f"loop: {algo} on {task}", loops
+    if "growth" in suites:
+        yield "growth", growth.rows(algos, tasks[0], members[0], **timing)
     for peer, count, algo, task in itertools.product(FLAGS.compare, members, algos, tasks):
         if algo in compare.ALGORITHMS[peer]:
-            yield from compare.compare(peer, algo, task, count, physics, FLAGS.peer_python, environment, **timing)
+            both = compare.compare(peer, algo, task, count, physics, FLAGS.peer_python, environment, **timing)
+            yield f"compare: {algo} on {task}, {peer}", both
 
 
 def machine() -> dict[str, Any]:
@@ -157,7 +191,8 @@ def machine() -> dict[str, Any]:
         names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
         cpu = f"{len(names)} x {names[0]}" if names else cpu
     device = jax.devices()[0]
-    return {"cpu": cpu, "device": f"{device.platform}: {device.device_kind}", "jax": jax.__version__}
+    kind = f"{device.platform}: {device.device_kind}"
+    return {"cpu": cpu, "device": kind, "devices": len(jax.devices()), "jax": jax.__version__}
 
 
 # Of the suites physics and loop: what is measured against what.
@@ -165,6 +200,7 @@ AGAINST = {
     ("physics", "mujoco"): "MuJoCo alone",
     ("physics", "mjx"): "mjx, the file's iterations",
     ("loop", "mujoco"): "mjx",
+    ("loop", "warp"): "mjx",
 }
 
 
@@ -180,14 +216,18 @@ def ratios(all_rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-HEADER = ("suite", "what", "members", "rate", "unit", "compile s", "GFLOP", "of the peak")
+HEADER = ("suite", "what", "members", "rate", "unit", "compile s", "GFLOP", "of the peak", "operations a step")
 
 
 def cells(row: Row, peak: float) -> tuple[str, ...]:
-    """The row under `HEADER`; the last two are empty where operations were not counted."""
-    counted = (f"{row.operations / 1e9:.3g}", f"{row.rate * row.operations / peak:.0%}") if row.operations else ("", "")
+    """The row under `HEADER`; empty is what was not measured."""
+    compiled = "" if row.compile_seconds is None else f"{row.compile_seconds:.1f}"
+    counted = f"{row.operations / 1e9:.3g}" if row.operations else ""
+    peak *= 1 if jax.default_backend() == "cpu" else row.devices  # of one device; a CPU's have the same cores
+    share = f"{row.rate * row.operations / peak:.0%}" if row.operations and peak else ""
+    profiled = f"{sum(kind.number for kind in row.kinds):,.0f}" if row.kinds else ""
     rate = f"{row.rate:,.0f}"
-    return (row.suite, row.what, str(row.members), rate, f"{row.unit}/s", f"{row.compile_seconds:.1f}", *counted)
+    return (row.suite, row.what, str(row.members), rate, f"{row.unit}/s", compiled, counted, share, profiled)
 
 
 def markdown(all_rows: Sequence[Row], peak: float) -> str:
@@ -195,38 +235,78 @@ def markdown(all_rows: Sequence[Row], peak: float) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def main(argv: Sequence[str]) -> None:
-    del argv
-    check_flags()
-    logging.set_verbosity(logging.WARNING)
-    environment = dict(os.environ)  # before our own options for XLA are in it
-    runtime.prepare()
-    jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
-    console = Console()
-    console.print(", ".join(f"{key}: {value}" for key, value in machine().items()), highlight=False)
-    if (most := max(map(int, FLAGS.devices))) > (here := len(jax.local_devices())):
-        sys.exit(f"--devices: takes at most {here} here, not {most}")
-    found = []
-    for row in rows(FLAGS.suites, physics_here(), environment, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
-        found.append(row)
-        console.print(f"{row.suite}: {row.what}, {row.members} members: {row.rate:,.0f} {row.unit}/s", highlight=False)
-        if row.kinds:
-            console.print(f"  {kernels.told(row.kinds)}", highlight=False)
-    peak = 0.0
-    if any(row.operations for row in found):
-        peak = operations.peak(seconds=FLAGS.seconds, repeats=FLAGS.repeats)
-        console.print(f"peak of matrix products: {peak / 1e9:,.0f} GFLOP/s", highlight=False)
+def tell(found: Row | Failure) -> None:
+    if isinstance(found, Failure):
+        print(f"failed: {found.what}: {found.why}", flush=True)
+        return
+    print(f"{found.suite}: {found.what}, {found.members} members: {found.rate:,.0f} {found.unit}/s", flush=True)
+    if found.kinds is not None:
+        print(f"  {kernels.told(found.kinds, found.members / found.rate)}", flush=True)
+
+
+def save(found: Sequence[Row], failed: Sequence[Failure], peak: float) -> None:
+    """--json; leaves with one line where it cannot be written."""
+    if not FLAGS.json:
+        return
+    report = {"machine": machine(), "peak": peak, "rows": [dataclasses.asdict(row) for row in found]}
+    report["failed"] = [failure._asdict() for failure in failed]
+    try:
+        with files.whole_file(Path(FLAGS.json)) as file:
+            file.write((json.dumps(report, indent=1) + "\n").encode())
+    except OSError as error:
+        sys.exit(f"--json={FLAGS.json}: takes a file that can be written: {error.strerror}")
+
+
+def show(found: Sequence[Row], peak: float) -> None:
+    """All rows as tables and figures."""
     table = Table(*HEADER, title="median of repeats")
     for row in found:
         table.add_row(*cells(row, peak))
-    console.print(table)
+    Console().print(table)
     print(markdown(found, peak))
     print("\n".join(ratios(found) + compare.ratios(found)))
     for path in growth.draw(found, Path(FLAGS.figures)):
         print(path)
-    if FLAGS.json:
-        report = {"machine": machine(), "peak": peak, "rows": [dataclasses.asdict(row) for row in found]}
-        Path(FLAGS.json).write_text(json.dumps(report, indent=1) + "\n")
+
+
+def main(argv: Sequence[str]) -> None:
+    del argv
+    check_flags()
+    logging.set_verbosity(logging.WARNING)
+    if FLAGS.compare:  # several processes share an accelerator's memory: none may take most of it in advance
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    environment = dict(os.environ)  # before our own options for XLA are in it
+    runtime.prepare()
+    jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
+    print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
+    devices_here()
+    physics = physics_here()
+    for name in () if FLAGS.physics else envs.PHYSICS:
+        if missing := envs.lacks(name):
+            print(f"without {name}, which needs {missing}", flush=True)
+    found: list[Row] = []
+    failed: list[Failure] = []
+    peak = 0.0
+    try:
+        for row in rows(FLAGS.suites, physics, environment, seconds=FLAGS.seconds, repeats=FLAGS.repeats):
+            tell(row)
+            if isinstance(row, Failure):
+                failed.append(row)
+            else:
+                found.append(row)
+            save(found, failed, peak)
+        if any(row.operations for row in found):
+            try:
+                peak = operations.peak(seconds=FLAGS.seconds, repeats=FLAGS.repeats)
+                print(f"peak of matrix products: {peak / 1e9:,.0f} GFLOP/s", flush=True)
+            except Exception as error:
+                failed.append(Failure("peak of matrix products", why(error)))
+                tell(failed[-1])
+            save(found, failed, peak)
+    finally:  # what was measured until somebody stopped it
+        show(found, peak)
+    if failed:
+        sys.exit(f"{len(failed)} failed: the lines that begin with `failed` say what, and why")
 
 
 if __name__ == "__main__":

@@ -233,7 +233,7 @@ FLAGS: dict[str, list[_Flag]] = {
             _integer,
             "a whole number",
             "devices (accelerators, or cores of a CPU) that the members are spread over",
-            "all accelerators; on a CPU as many cores as share the members evenly",
+            "accelerators: all that get a member of their own; on a CPU as many cores as share the members evenly",
         ),
         _Flag("tensorboard", None, "true or false", "also write TensorBoard events", "true"),
         _Flag("quiet", None, "true or false", "print errors only", "false"),

@@ -1,6 +1,7 @@
 """How cost grows with members, critics and the replay's capacity: `python -m experiments.bench --suite=growth`."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from experiments.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
-from experiments.measure import REPLAYS, Row, bench_replay, bench_updates
+from experiments.measure import REPLAYS, Case, Failure, Row, in_turns, replay_case, updates
 
 MEMBERS = (1, 2, 5, 10, 25, 50)
 CRITICS = (2, 5, 10)
@@ -24,20 +25,29 @@ LABELS = {
 UNITS = {"members": 1e3, "critics": 1e3, "capacity": 1e6}
 
 
-def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterator[Row]:
-    """Updates over members and critics, samples over capacities; `members` where they do not vary."""
+def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterator[Row | Failure]:
+    """Updates over members and critics, samples over capacities; `members` where they do not vary.
+
+    The points of a line are measured in turns: a machine that slows down bends none of them.
+    """
     for algo in algos:
-        for count in MEMBERS:
-            (row,) = bench_updates(algo, task, count, **timing)
-            yield dataclasses.replace(row, suite="growth", point=("members", algo, count))
-        for count in CRITICS:
-            (row,) = bench_updates(algo, task, members, settings={"ensemble_size": count}, **timing)
-            what = f"{row.what}, {count} critics"
-            yield dataclasses.replace(row, suite="growth", what=what, point=("critics", algo, count))
+        yield from in_turns([_update(algo, task, count, ("members", algo, count)) for count in MEMBERS], **timing)
+        critics = [_update(algo, task, members, ("critics", algo, count), ensemble_size=count) for count in CRITICS]
+        yield from in_turns(critics, **timing)
     for kind in REPLAYS:
-        for capacity in CAPACITIES:
-            row = bench_replay(kind, "sample", task, capacity, members, **timing)
-            yield dataclasses.replace(row, suite="growth", point=("capacity", kind, capacity))
+        yield from in_turns([_sample(kind, task, members, capacity) for capacity in CAPACITIES], **timing)
+
+
+def _update(algo: str, task: str, members: int, point: tuple[str, str, int], **settings: int) -> Case:
+    varied, _, value = point
+    what = f"{algo}, {task} sizes" + (f", {value} critics" if varied == "critics" else "")
+    row = Row("growth", what, members, "member updates", point=point)
+    return Case(row, functools.partial(updates, algo, task, members, **settings))
+
+
+def _sample(kind: str, task: str, members: int, capacity: int) -> Case:
+    row, make = replay_case(kind, "sample", task, capacity, members)
+    return Case(dataclasses.replace(row, suite="growth", point=("capacity", kind, capacity)), make)
 
 
 def draw(found: Sequence[Row], folder: Path) -> list[Path]:
@@ -61,7 +71,7 @@ def _draw(points: dict[str, dict[int, float]], x_label: str, y_label: str, path:
     axes = figure.add_subplot()
     for index, (name, line) in enumerate(points.items()):
         colour = ALGORITHM_COLOURS.get(name, COLOURS[index % len(COLOURS)])
-        axes.plot(list(line), list(line.values()), color=colour, marker=MARKERS[index], label=name)
+        axes.plot(list(line), list(line.values()), color=colour, marker=MARKERS[index % len(MARKERS)], label=name)
     values = sorted({x for line in points.values() for x in line})
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(FixedLocator(values))

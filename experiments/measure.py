@@ -1,4 +1,8 @@
-"""The measurements of the benchmark: how fast one part is, compiled as it is used."""
+"""The measurements of the benchmark: how fast one part is, compiled as it is used.
+
+What is to be compared is made first and then measured in turns (`in_turns`). A case that fails gives a line that says
+why, in place of its row.
+"""
 
 import concurrent.futures
 import dataclasses
@@ -6,7 +10,7 @@ import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +19,9 @@ import numpy as np
 from mujoco import rollout as rollout_c
 
 from experiments import kernels, operations
-from experiments.timing import measure, measure_in_turns
+from experiments.timing import tried_in_turns
 from sqt_jax import algorithms, envs, lap, replay, rollout, train
+from sqt_jax.config import Config
 from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
 from sqt_jax.members import Layout, member_axes
@@ -26,7 +31,8 @@ from sqt_jax.types import Array, Transition
 BATCH = 256
 NO_SETTINGS: Mapping[str, Any] = MappingProxyType({})
 LOOP_ROWS = 1_000_000  # of the replays of all members together, where a loop is measured
-PROFILED = 20  # lockstep steps
+LARGE = 8e9  # bytes on the device, of loops that are measured in turns: what takes more is measured one after the other
+PROFILED = 4  # lockstep steps; the actor learns in half of them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,21 +43,84 @@ class Row:
     what: str
     members: int
     unit: str
-    rate: float
-    compile_seconds: float
+    rate: float = 0.0
+    compile_seconds: float | None = None  # None: not measured
     operations: float = 0.0  # floating-point, of one unit; 0: not counted
-    kinds: tuple[kernels.Kind, ...] = ()  # what runs on the device, of a lockstep step; empty: not profiled
+    devices: int = 1
+    kinds: tuple[kernels.Kind, ...] | None = None  # what runs on the device, of a lockstep step; None: not profiled
     point: tuple[str, str, int] | None = None  # in a figure of growth: what is varied, the line, the value
+
+
+class Failure(NamedTuple):
+    """What there is no figure of, and why, in a line."""
+
+    what: str
+    why: str
+
+
+class Made(NamedTuple):
+    """What is ready to be measured."""
+
+    run: Callable[[int], Any]  # a number of iterations, each of all members -> what it waits for
+    operations: float = 0.0  # as in a row
+    compile_seconds: float | None = None  # None: those of the first call
+
+
+class Case(NamedTuple):
+    """Something to be measured beside others."""
+
+    row: Row  # without its figures
+    make: Callable[[], Made]
+
+
+def in_turns(cases: Sequence[Case], profiled: bool = False, **timing: Any) -> Iterator[Row | Failure]:
+    """Makes all cases and measures them in turns; one that fails is told in its place, and the others go on.
+
+    A profile that fails leaves its row as it is without one.
+    """
+    ready = []
+    for row, make in cases:
+        try:
+            ready.append((row, make()))
+        except Exception as error:
+            yield failure(row, error)
+    for (row, made), found in zip(ready, tried_in_turns([made.run for _, made in ready], **timing), strict=True):
+        if isinstance(found, Exception):
+            yield failure(row, found)
+            continue
+        rate, first_seconds = found
+        seconds = first_seconds if made.compile_seconds is None else made.compile_seconds
+        row = dataclasses.replace(row, rate=rate * row.members, compile_seconds=seconds, operations=made.operations)
+        if profiled:
+            try:
+                row = dataclasses.replace(row, kinds=tuple(kernels.profile(made.run, PROFILED)))
+            except Exception as error:
+                yield failure(row, error, "profile of ")
+        yield row
+
+
+def failure(row: Row, error: Exception, part: str = "") -> Failure:
+    return Failure(f"{part}{row.suite}: {row.what}, {row.members} members", why(error))
+
+
+def why(error: Exception) -> str:
+    """An error in one line."""
+    line = next(filter(None, map(str.strip, str(error).splitlines())), "")
+    return f"{type(error).__name__}: {line[:300]}"
+
+
+def making(steps: Callable[..., Callable[[int], Any]], *arguments: Any, **options: Any) -> Callable[[], Made]:
+    return lambda: Made(steps(*arguments, **options))
 
 
 def member_keys(members: int) -> Array:
     return jax.vmap(jax.random.key)(jnp.arange(members))
 
 
-def bench_env(task: str, members: int, physics: str, **timing: Any) -> Row:
+def bench_env(task: str, members: int, physics: str, **timing: Any) -> Iterator[Row | Failure]:
     """Environment steps with random actions, automatic restarts included."""
-    rate, compile_seconds = measure(env_steps(task, members, physics), **timing)
-    return Row("env", f"{task}, {physics}", members, "env steps", rate * members, compile_seconds)
+    row = Row("env", f"{task}, {physics}", members, "env steps")
+    return in_turns([Case(row, making(env_steps, task, members, physics))], **timing)
 
 
 def env_steps(task: str, members: int, physics: str, **options: Any) -> Callable[[int], Any]:
@@ -121,15 +190,16 @@ def bare_steps(task: str, members: int) -> Callable[[int], None]:
     return run
 
 
-def bench_physics(task: str, members: int, solver: Mapping[str, dict[str, int]], **timing: Any) -> Iterator[Row]:
+def bench_physics(
+    task: str, members: int, solver: Mapping[str, dict[str, int]], **timing: Any
+) -> Iterator[Row | Failure]:
     """One task on each physics, beside MuJoCo alone and MJX with the model file's and with other solver settings."""
-    runs = {"MuJoCo alone": bare_steps(task, members)}
-    runs |= {name: env_steps(task, members, name) for name in envs.PHYSICS if not envs.lacks(name)}
-    runs["mjx, the file's iterations"] = env_steps(task, members, "mjx", iterations=None, ls_iterations=None)
-    runs |= {f"mjx {limits}": env_steps(task, members, "mjx", **options) for limits, options in solver.items()}
-    rates = measure_in_turns(list(runs.values()), **timing)
-    for what, (rate, compile_seconds) in zip(runs, rates, strict=True):
-        yield Row("physics", f"{task}, {what}", members, "env steps", rate * members, compile_seconds)
+    made = {"MuJoCo alone": making(bare_steps, task, members)}
+    made |= {name: making(env_steps, task, members, name) for name in envs.PHYSICS if not envs.lacks(name)}
+    made["mjx, the file's iterations"] = making(env_steps, task, members, "mjx", iterations=None, ls_iterations=None)
+    made |= {f"mjx {limits}": making(env_steps, task, members, "mjx", **options) for limits, options in solver.items()}
+    cases = [Case(Row("physics", f"{task}, {what}", members, "env steps"), make) for what, make in made.items()]
+    return in_turns(cases, **timing)
 
 
 def bench_updates(
@@ -139,22 +209,32 @@ def bench_updates(
     devices: Sequence[int] = (1,),
     settings: Mapping[str, Any] = NO_SETTINGS,
     **timing: Any,
-) -> Iterator[Row]:
+) -> Iterator[Row | Failure]:
     """Updates on one fixed batch, on each number of devices in turn: the learner alone."""
-    cases = {_on("sizes", count): count for count in devices if count <= members}
-    runs, counts = zip(*(updates(algo, task, members, count, **settings) for count in cases.values()), strict=True)
-    rates = measure_in_turns(runs, **timing)
-    for name, count, (rate, seconds) in zip(cases, counts, rates, strict=True):
-        yield Row("update", f"{algo}, {task} {name}", members, "member updates", rate * members, seconds, count)
+    cases = [
+        Case(
+            Row("update", f"{algo}, {task} {_on('sizes', count)}", members, "member updates", devices=count),
+            functools.partial(updates, algo, task, members, count, **settings),
+        )
+        for count in fitting(devices, members)
+    ]
+    yield from in_turns(cases, **timing)
 
 
 def _on(what: str, devices: int) -> str:
     return f"{what}, {devices} devices" if devices > 1 else what
 
 
-def updates(
-    algo: str, task: str, members: int, devices: int = 1, **settings: Any
-) -> tuple[Callable[[int], Any], float]:
+def fitting(devices: Sequence[int], members: int) -> list[int]:
+    """Those numbers of devices that have a member for each; a line says so where none has."""
+    found = [count for count in devices if count <= members]
+    if not found:
+        numbers = " or ".join(map(str, devices))
+        print(f"no figure of {members} members on {numbers} devices: each takes one at least", flush=True)
+    return found
+
+
+def updates(algo: str, task: str, members: int, devices: int = 1, **settings: Any) -> Made:
     """A number of updates -> the state after them; and the floating-point operations of one member's update."""
     config = algorithms.make_config(algo, task, **settings)
     env = envs.make(task)
@@ -188,14 +268,26 @@ def updates(
     batch = jax.jit(layout.over_members(random_batch, (0,), 0))(keys)
     one = jax.eval_shape(random_batch, jax.random.key(0))
     count = operations.of_update(agent, example, one, config.agent.policy_delay)
-    return lambda steps: run(state, batch, keys, steps), count
+    return Made(lambda steps: run(state, batch, keys, steps), count)
 
 
 REPLAYS = {"uniform": replay.uniform, "lap": lap.lap}
 
 
-def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, **timing: Any) -> Row:
+def bench_replay(
+    kind: str, what: str, task: str, capacity: int, members: int, **timing: Any
+) -> Iterator[Row | Failure]:
     """One insert of a row, or one sampled batch and what it feeds back, on a full buffer."""
+    return in_turns([replay_case(kind, what, task, capacity, members)], **timing)
+
+
+def replay_case(kind: str, what: str, task: str, capacity: int, members: int) -> Case:
+    row = Row("replay", f"{kind} {what}, {task} rows, capacity {capacity:,}", members, f"{what}s")
+    return Case(row, making(replay_steps, kind, what, task, capacity, members))
+
+
+def replay_steps(kind: str, what: str, task: str, capacity: int, members: int) -> Callable[[int], Any]:
+    """A number of inserts or samples -> what it waits for."""
     env = envs.make(task)
     ring = Ring(capacity, env.observation_size, env.action_size, shortest_episode=env.shortest_episode)
     store = REPLAYS[kind](ring, BATCH)
@@ -219,7 +311,8 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
         return jax.lax.fori_loop(0, steps, body, (state, total))
 
     run = jax.jit(functools.partial(loop, one), donate_argnums=0)
-    fill = jax.jit(functools.partial(loop, jax.vmap(insert, in_axes=(axes, 0, 0, None), out_axes=(axes, 0))))
+    insert_one = jax.vmap(insert, in_axes=(axes, 0, 0, None), out_axes=(axes, 0))
+    fill = jax.jit(functools.partial(loop, insert_one), donate_argnums=0)
     keys, total = member_keys(members), jnp.zeros(members)
     state, _ = fill(jax.jit(jax.vmap(lambda _: store.init(), out_axes=axes))(keys), total, keys, capacity)
 
@@ -228,9 +321,7 @@ def bench_replay(kind: str, what: str, task: str, capacity: int, members: int, *
         state, total = run(state, jnp.zeros(members), keys, steps)
         return total
 
-    rate, compile_seconds = measure(once, **timing)
-    name = f"{kind} {what}, {task} rows, capacity {capacity:,}"
-    return Row("replay", name, members, f"{what}s", rate * members, compile_seconds)
+    return once
 
 
 def bench_loops(
@@ -241,22 +332,33 @@ def bench_loops(
     devices: Sequence[int] = (1,),
     profiled: bool = False,
     **timing: Any,
-) -> Iterator[Row]:
-    """The whole training loop, on each physics and number of devices in turn: environment, insert, sample, update."""
-    cases = {_on(name, count): (name, count) for name in physics for count in devices if count <= members}
-    runs, compile_seconds = zip(*(loop_steps(algo, task, members, *case) for case in cases.values()), strict=True)
-    rates = measure_in_turns(runs, **timing)
-    for name, run, (rate, _), seconds in zip(cases, runs, rates, compile_seconds, strict=True):
-        kinds = tuple(kernels.profile(run, PROFILED)) if profiled else ()
-        yield Row("loop", f"{algo} on {task}, {name}", members, "env steps", rate * members, seconds, kinds=kinds)
+) -> Iterator[Row | Failure]:
+    """The whole training loop, on each physics and number of devices in turn: environment, insert, sample, update.
+
+    Where all of them together would take too much memory, one after the other.
+    """
+    counts = fitting(devices, members)
+    cases = [
+        Case(
+            Row("loop", f"{algo} on {task}, {_on(name, count)}", members, "env steps", devices=count),
+            functools.partial(loop_steps, algo, task, members, name, count),
+        )
+        for name in physics
+        for count in counts
+    ]
+    large = len(cases) * algorithms.memory_estimate(loop_config(algo, task, members), members) > LARGE
+    for together in [[case] for case in cases] if large else [cases]:
+        yield from in_turns(together, profiled, **timing)
 
 
-def loop_steps(
-    algo: str, task: str, members: int, physics: str, devices: int = 1
-) -> tuple[Callable[[int], Any], float]:
-    """A number of lockstep steps of training -> what it waits for; and the seconds of compilation."""
+def loop_config(algo: str, task: str, members: int, physics: str | None = None) -> Config:
     capacity = min(100_000, max(1_000, LOOP_ROWS // members))
-    config = algorithms.make_config(algo, task, replay_capacity=capacity, physics=physics)
+    return algorithms.make_config(algo, task, replay_capacity=capacity, physics=physics)
+
+
+def loop_steps(algo: str, task: str, members: int, physics: str, devices: int = 1) -> Made:
+    """A number of lockstep steps of training -> what it waits for; and the seconds of compilation."""
+    config = loop_config(algo, task, members, physics)
     layout = Layout(members, tuple(jax.local_devices()[:devices]))
     sweep = train.make_sweep(algorithms.make_trainer(config), layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
@@ -271,4 +373,4 @@ def loop_steps(
         state = sweep.advance(state, steps, True)
         return state.env_steps
 
-    return once, compile_seconds
+    return Made(once, compile_seconds=compile_seconds)

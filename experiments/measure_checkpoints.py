@@ -40,7 +40,7 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
     def row(what: str, seconds: list[float]) -> Row:
-        return Row("checkpoint", f"{algo}, {task}, {what}", members, "checkpoints", 1 / statistics.median(seconds), 0.0)
+        return Row("checkpoint", f"{algo}, {task}, {what}", members, "checkpoints", 1 / statistics.median(seconds))
 
     yield row(f"all {FILLED:,} rows, {size / 1e6:,.0f} MB", everything)
     yield row(f"{SINCE:,} new rows", later)

@@ -65,7 +65,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     except ValueError as error:
         raise flags.UsageError(f"--physics: {error}") from None
     output = _output(options, run, config.train)
-    layout = _layout(len(members), output)
+    layout = _layout(len(members), output["devices"], typed=options.devices is not None)
     needed, free = memory_estimate(config, layout.held, env), _free_memory(len(layout.devices))
     if needed > free:
         raise flags.UsageError(
@@ -139,12 +139,13 @@ def _output(options: flags.Options, run: Described | None, train: TrainConfig) -
     return output
 
 
-def _layout(num_members: int, output: dict[str, Any]) -> Layout:
-    """Where the members lie, by --devices, which becomes the number of devices where it was not given."""
+def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
+    """Where the members lie, by --devices; None is chosen here, anew whenever a run goes on: it may do so elsewhere."""
     here = jax.local_devices()
-    count = output["devices"] = output["devices"] or usable_devices(num_members)
+    count = devices or usable_devices(num_members)
     if count > len(here):
-        raise flags.UsageError(f"--devices={count}: takes at most {len(here)} here")
+        whose = "" if typed else ", and the run was started with more"
+        raise flags.UsageError(f"--devices={count}: takes at most {len(here)} here{whose}")
     if count > num_members:
         raise flags.UsageError(f"--devices={count}: takes at most one for each of {num_members} members")
     return Layout(num_members, tuple(here[:count]))

@@ -2,8 +2,9 @@
 
 import pytest
 
-from experiments import growth
+from experiments import growth, measure
 from experiments.measure import Row
+from sqt_jax import algorithms
 
 
 def row(point, rate):
@@ -11,26 +12,28 @@ def row(point, rate):
 
 
 def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
-    made = []
+    """Each line in turns."""
+    made, lines = [], []
 
-    def update(algo, task, members, settings=None, **timing):
-        made.append((algo, task, members, settings))
-        yield row(None, 1.0)
+    def in_turns(cases, **timing):
+        lines.append([case.row.point for case in cases])
+        for case in cases:
+            case.make()
+            yield case.row
 
-    def sample(kind, what, task, capacity, members, **timing):
-        made.append((kind, what, task, capacity, members))
-        return row(None, 1.0)
-
-    monkeypatch.setattr(growth, "bench_updates", update)
-    monkeypatch.setattr(growth, "bench_replay", sample)
-    points = [found.point for found in growth.rows(["td3"], "ant", 5, seconds=0.0, repeats=1)]
-    assert points == [
-        *(("members", "td3", count) for count in growth.MEMBERS),
-        *(("critics", "td3", count) for count in growth.CRITICS),
-        *(("capacity", kind, capacity) for kind in ("uniform", "lap") for capacity in growth.CAPACITIES),
+    monkeypatch.setattr(growth, "in_turns", in_turns)
+    monkeypatch.setattr(growth, "updates", lambda *case, **settings: made.append((*case, settings)))
+    monkeypatch.setattr(measure, "replay_steps", lambda *case: made.append(case))
+    rows = list(growth.rows(["td3"], "ant", 5, seconds=0.0, repeats=1))
+    assert lines == [
+        [("members", "td3", count) for count in growth.MEMBERS],
+        [("critics", "td3", count) for count in growth.CRITICS],
+        *([("capacity", kind, capacity) for capacity in growth.CAPACITIES] for kind in ("uniform", "lap")),
     ]
-    assert ("td3", "ant", 50, None) in made and ("td3", "ant", 5, {"ensemble_size": 10}) in made
+    assert ("td3", "ant", 50, {}) in made and ("td3", "ant", 5, {"ensemble_size": 10}) in made
     assert ("lap", "sample", "ant", 1_000_000, 5) in made
+    assert [found.point for found in rows] == sum(lines, []) and {found.suite for found in rows} == {"growth"}
+    assert rows[5].what == "td3, ant sizes" and rows[5].members == 50 and rows[8].what == "td3, ant sizes, 10 critics"
 
 
 def test_a_figure_shows_the_time_of_one_at_every_point(tmp_path, monkeypatch):
@@ -45,7 +48,9 @@ def test_a_figure_shows_the_time_of_one_at_every_point(tmp_path, monkeypatch):
 
 
 def test_figures_are_pictures_with_every_value_on_the_axis(tmp_path):
-    rows = [row(("members", name, count), 100.0 * count) for name in ("td3", "td7") for count in growth.MEMBERS]
+    names = algorithms.ALGORITHMS  # more than there are markers
+    assert len(names) > len(growth.MARKERS)
+    rows = [row(("members", name, count), 100.0 * count) for name in names for count in growth.MEMBERS]
     (path,) = growth.draw(rows, tmp_path / "new")
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 

@@ -1,17 +1,82 @@
 """The benchmark's measurements: rows that say what was measured."""
 
+import weakref
+
 import jax
 import pytest
 
-from experiments import measure
+from experiments import kernels, measure
+from experiments.measure import Case, Failure, Made, Row
 
 SHORT = {"seconds": 0.0, "repeats": 1}
+
+
+def case(what, run=lambda steps: None, **made):
+    return Case(Row("loop", what, 5, "env steps"), lambda: Made(run, **made))
+
+
+def failing(*_):
+    raise ValueError("\n  No memory [/left]\nand more of it")
+
+
+def test_a_case_that_fails_is_told_and_the_others_are_measured(monkeypatch):
+    monkeypatch.setattr(kernels, "profile", lambda run, steps: [kernels.Kind("dot", steps, 1.0)])
+    cases = [Case(Row("loop", "a", 5, "env steps"), failing), case("b", failing), case("c", operations=2.0)]
+    unmade, unmeasured, row = measure.in_turns(cases, profiled=True, **SHORT)
+    assert unmade == Failure("loop: a, 5 members", "ValueError: No memory [/left]")
+    assert unmeasured == Failure("loop: b, 5 members", "ValueError: No memory [/left]")
+    assert row.rate > 0 and row.operations == 2.0 and row.kinds == (kernels.Kind("dot", 4, 1.0),)
+
+
+def test_a_profile_that_fails_loses_no_figure(monkeypatch):
+    monkeypatch.setattr(kernels, "profile", failing)
+    failed, row = measure.in_turns([case("a", compile_seconds=3.0)], profiled=True, **SHORT)
+    assert failed == Failure("profile of loop: a, 5 members", "ValueError: No memory [/left]")
+    assert row.rate > 0 and row.compile_seconds == 3.0 and row.kinds is None
+
+
+@pytest.mark.parametrize(("limit", "most"), [(0, 1), (1e12, 3)])
+def test_large_loops_are_on_the_device_one_at_a_time(monkeypatch, limit, most):
+    class State:
+        """What a loop holds."""
+
+    alive, counts = weakref.WeakSet(), []
+
+    def loop_steps(algo, task, members, physics, devices):
+        state = State()
+        alive.add(state)
+
+        def run(steps, state=state):
+            counts.append(len(alive))
+            if physics == "b":
+                raise MemoryError(physics)
+
+        return Made(run, compile_seconds=1.0)
+
+    monkeypatch.setattr(measure, "LARGE", limit)
+    monkeypatch.setattr(measure, "loop_steps", loop_steps)
+    first, failed, last = measure.bench_loops("td3", "cheetah", 5, ["a", "b", "c"], **SHORT)
+    assert max(counts) == most and not alive
+    assert (first.what, failed.what, last.what) == (
+        "td3 on cheetah, a",
+        "loop: td3 on cheetah, b, 5 members",
+        "td3 on cheetah, c",
+    )
+
+
+def test_fewer_members_than_devices_give_no_row_and_a_line(capsys):
+    assert list(measure.bench_updates("td3", "cheetah", 1, (2, 4), **SHORT)) == []
+    assert list(measure.bench_loops("td3", "cheetah", 1, ["mjx"], (2,), **SHORT)) == []
+    assert capsys.readouterr().out.splitlines() == [
+        "no figure of 1 members on 2 or 4 devices: each takes one at least",
+        "no figure of 1 members on 2 devices: each takes one at least",
+    ]
 
 
 @pytest.mark.parametrize("kind", measure.REPLAYS)
 @pytest.mark.parametrize("what", ["insert", "sample"])
 def test_a_replays_row_names_what_was_measured(kind, what):
-    row = measure.bench_replay(kind, what, "cheetah", 300, 2, **SHORT)
+    (row,) = measure.bench_replay(kind, what, "cheetah", 300, 2, **SHORT)
     assert (row.suite, row.what) == ("replay", f"{kind} {what}, cheetah rows, capacity 300")
     assert (row.members, row.unit) == (2, f"{what}s") and row.rate > 0
 
@@ -37,4 +102,5 @@ def test_an_update_is_measured_on_each_number_of_devices_that_has_members():
     settings = {"hidden": (16, 16), "batch_size": 16}
     rows = list(measure.bench_updates("td3", "cheetah", 2, (1, 2, 5), settings, **SHORT))
     assert [row.what for row in rows] == ["td3, cheetah sizes", "td3, cheetah sizes, 2 devices"]
+    assert [row.devices for row in rows] == [1, 2]
     assert rows[0].operations == rows[1].operations > 0

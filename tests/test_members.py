@@ -1,5 +1,6 @@
 """Members along devices: how many each holds, and that nothing depends on where they lie."""
 
+import math
 import os
 import socket
 import subprocess
@@ -17,7 +18,7 @@ from sqt_jax import algorithms, members, train
 from sqt_jax.members import Layout
 
 DEVICES = tuple(jax.local_devices()[:2])
-pytestmark = pytest.mark.skipif(len(DEVICES) < 2, reason="one device only")
+two_devices = pytest.mark.skipif(len(DEVICES) < 2, reason="one device only")
 
 
 @pytest.mark.parametrize(
@@ -32,12 +33,26 @@ def test_shares_are_equal(count, devices, held):
 
 @pytest.mark.parametrize(
     ("backend", "here", "count", "used"),
-    [("cpu", 2, 5, 1), ("cpu", 2, 6, 2), ("cpu", 8, 6, 6), ("cpu", 4, 6, 3), ("gpu", 4, 5, 4), ("gpu", 8, 5, 5)],
+    [
+        ("cpu", 2, 5, 1),
+        ("cpu", 2, 6, 2),
+        ("cpu", 8, 6, 6),
+        ("cpu", 4, 6, 3),
+        ("gpu", 1, 5, 1),
+        ("gpu", 4, 4, 4),
+        ("gpu", 4, 5, 3),  # shares of two: the fourth would hold copies alone
+        ("gpu", 4, 7, 4),
+        ("gpu", 8, 5, 5),
+        ("gpu", 8, 17, 6),
+    ],
 )
-def test_a_sweep_takes_all_accelerators_and_the_cores_that_share_it_evenly(monkeypatch, backend, here, count, used):
+def test_a_sweep_takes_the_accelerators_that_get_members_and_the_cores_that_share_it_evenly(
+    monkeypatch, backend, here, count, used
+):
     monkeypatch.setattr(jax, "local_devices", lambda: list(range(here)))
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     assert members.usable_devices(count) == used
+    assert backend == "cpu" or Layout(count, (jax.devices()[0],) * used).held - count < math.ceil(count / used)
 
 
 def trained(sweep, config, count):
@@ -61,12 +76,14 @@ def numbers(tree):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
 
 
+@two_devices
 def test_members_start_on_two_devices_as_on_one_bit_for_bit(both):
     _, ((one, _), (two, _)) = both
     for a, b in zip(numbers(one), numbers(two), strict=True):
         np.testing.assert_array_equal(a, b[:3])
 
 
+@two_devices
 def test_members_train_on_two_devices_as_on_one(both):
     sweeps, ((_, one), (_, two)) = both
     for a, b in zip(numbers(one), numbers(two), strict=True):
@@ -79,6 +96,7 @@ def test_members_train_on_two_devices_as_on_one(both):
         np.testing.assert_allclose(a, b[:3], rtol=1e-3, atol=1e-4)
 
 
+@two_devices
 def test_each_device_holds_its_share_alone(both):
     _, (_, (_, state)) = both
     for leaf in jax.tree.leaves((state.agent.actor, state.replay)):
@@ -88,6 +106,7 @@ def test_each_device_holds_its_share_alone(both):
         assert [shard.data.shape[0] for shard in leaf.addressable_shards] == [2, 2]
 
 
+@two_devices
 def test_one_program_for_all_devices_whatever_the_number_of_steps(both):
     sweeps, _ = both
     assert sweeps[1].advance._cache_size() == 1
@@ -116,9 +135,14 @@ def test_members_train_over_two_processes_as_in_one(tmp_path):
         )
         for rank in range(2)
     ]
-    for process in started:
-        output, _ = process.communicate(timeout=240)
-        assert process.returncode == 0, output
+    try:
+        for process in started:
+            output, _ = process.communicate(timeout=240)
+            assert process.returncode == 0, output
+    finally:  # where one ended or hangs, the other waits for it
+        for process in started:
+            process.kill()
+            process.wait()
     for rank in range(2):
         returns = np.load(tmp_path / f"{rank}.npy")
         assert returns.shape == (4, 2)

@@ -8,7 +8,6 @@ import pytest
 
 from experiments import described, flags
 from experiments.plan import make_plan
-from sqt_jax.members import usable_devices
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
@@ -111,7 +110,7 @@ def test_a_folder_says_what_run_it_is(tmp_path):
     assert again.members == made.members
 
 
-DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": usable_devices(2)}
+DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None}
 
 
 @pytest.mark.parametrize(
@@ -122,6 +121,9 @@ DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints":
         ({"checkpoint_every": 20, "tensorboard": False}, [], {"checkpoint_every": 20, "tensorboard": False}),
         ({"checkpoint_every": 0, "keep_checkpoints": 5}, [], {"checkpoint_every": 0, "keep_checkpoints": 5}),
         ({"checkpoint_every": 20}, ["--checkpoint_every=40"], {"checkpoint_every": 40}),
+        ({"devices": 1}, [], {"devices": 1}),
+        ({"devices": 99}, ["--devices=1"], {"devices": 1}),
+        ({"devices": 0}, [], {}),
         ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
         # What no command line could have given counts as not there.
         ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
@@ -157,3 +159,19 @@ def test_there_is_no_device_without_a_member(tmp_path, monkeypatch):
     with pytest.raises(flags.UsageError, match=r"^--devices=3: takes at most one for each of 2 members$"):
         plan(tmp_path, "--seeds=0,1", "--devices=3", "--name=a")
     assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4
+
+
+def test_devices_that_nobody_named_are_chosen_anew_where_a_run_goes_on(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "local_devices", lambda: jax.devices()[:1] * 4)
+        path = begun(tmp_path, "a")
+        assert len(plan(tmp_path, "--name=b").layout.devices) == 2  # of two members
+        named = begun(tmp_path, "c", "--devices=2")
+    assert json.loads((path / "config.json").read_text())["output"]["devices"] is None
+    monkeypatch.setattr(jax, "local_devices", lambda: jax.devices()[:1])
+    assert len(plan(tmp_path, f"--resume={path}", new="").layout.devices) == 1
+    with pytest.raises(flags.UsageError, match="^--devices=2: .* 1 here, and the run was started with more$"):
+        plan(tmp_path, f"--resume={named}", new="")
+    with pytest.raises(flags.UsageError, match="^--devices=2: takes at most 1 here$"):
+        plan(tmp_path, f"--resume={named}", "--devices=2", new="")
+    assert len(plan(tmp_path, f"--resume={named}", "--devices=1", new="").layout.devices) == 1

@@ -6,8 +6,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from absl.testing import flagsaver
 
-from experiments import flags, play, plots, report, run, tables
+from experiments import bench, flags, play, plots, report, run, tables
 from experiments.plan import make_plan
 
 ROOT = Path(__file__).parent.parent
@@ -25,6 +26,7 @@ def commands(text, *modules):
 
 COMMANDS = commands(SHELL, "run")
 LOOKS = commands(SHELL, "tables", "plots", "report", "play")
+BENCHES = commands(SHELL, "bench")
 
 
 def understood(argv):
@@ -63,6 +65,14 @@ def test_commands_that_look_at_runs_are_understood(argv):
     assert understood(argv).runs
 
 
+@pytest.mark.parametrize("argv", BENCHES, ids=lambda argv: " ".join(argv))
+def test_commands_that_measure_are_understood(argv, monkeypatch):
+    monkeypatch.setattr(bench.compare, "lacks", lambda peer, interpreter: False)
+    with flagsaver.flagsaver():
+        assert bench.FLAGS(argv) == argv[:1]  # nothing is left over
+        bench.check_flags()
+
+
 def test_the_miniatures_commands_are_understood():
     made = subprocess.run(["make", "--dry-run", "miniature"], cwd=ROOT, capture_output=True, text=True, check=True)
     ((_, *sweep),) = commands(made.stdout, "sweep")
@@ -74,7 +84,7 @@ def test_the_miniatures_commands_are_understood():
 
 
 def test_the_readme_has_them():
-    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4 and len(LOOKS) >= 7
+    assert len(PYTHON) >= 3 and len(COMMANDS) >= 4 and len(LOOKS) >= 7 and len(BENCHES) >= 4
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

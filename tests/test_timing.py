@@ -1,5 +1,7 @@
 """Rates: iterations per second, medians, taken in turns."""
 
+import pytest
+
 from experiments import timing
 
 
@@ -29,3 +31,28 @@ def test_timed_calls_take_turns(monkeypatch):
     found = timing.measure_in_turns([run("a", 0.5), run("b", 0.25)], seconds=1, repeats=3)
     assert found == [(2.0, 0.5), (4.0, 0.25)]
     assert "".join(calls).endswith("ababab")
+
+
+def test_one_that_fails_drops_out_and_the_others_are_measured(monkeypatch):
+    now, calls = 0.0, {"a": 0, "b": 0, "c": 0}
+
+    def run(name, last):
+        def once(iterations):
+            nonlocal now
+            calls[name] += 1
+            if calls[name] == last:
+                raise ValueError(name)
+            now += iterations
+
+        return once
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now)
+    first, whole, third = timing.tried_in_turns([run("a", 1), run("b", None), run("c", 4)], seconds=1, repeats=3)
+    assert whole == (1.0, 1.0) and calls == {"a": 1, "b": 5, "c": 4}
+    assert (str(first), str(third)) == ("a", "c")
+    assert first.__traceback__ is None  # whose frames would keep arrays
+
+
+def test_a_measurement_alone_raises_what_its_run_raised():
+    with pytest.raises(ZeroDivisionError):
+        timing.measure(lambda iterations: 1 // 0, seconds=1, repeats=1)

@@ -1,7 +1,8 @@
-"""TD7's update in PyTorch, built as its authors' code is: `python torch_td7.py OBSERVATION_SIZE ACTION_SIZE SEED`.
+"""TD7's update in PyTorch, built as its authors' code is: `python torch_td7.py OBSERVATIONS ACTIONS DEVICE SEED`.
 
 One agent, a fixed batch of 256, networks of (256, 256) and embeddings of 256, the actor every second update, copies
-every 250: https://arxiv.org/abs/2306.02451. Two critics are one module, as there. On all cores that PyTorch takes.
+every 250: https://arxiv.org/abs/2306.02451. Two critics are one module, as there. DEVICE is cpu or cuda, which the
+authors take where it is; on a CPU, `experiments.compare` says by OMP_NUM_THREADS how many threads compute.
 """
 
 import copy
@@ -67,10 +68,10 @@ class Critics(nn.Module):
 
 
 class TD7:
-    def __init__(self, observations: int, actions: int):
-        self.encoder = Encoder(observations, actions)
-        self.actor = Actor(observations, actions)
-        self.critics = Critics(observations, actions)
+    def __init__(self, observations: int, actions: int, device: str):
+        self.encoder = Encoder(observations, actions).to(device)
+        self.actor = Actor(observations, actions).to(device)
+        self.critics = Critics(observations, actions).to(device)
         self.fixed, self.fixed_target = copy.deepcopy(self.encoder), copy.deepcopy(self.encoder)
         self.target_actor, self.target_critics = copy.deepcopy(self.actor), copy.deepcopy(self.critics)
         nets = (self.encoder, self.actor, self.critics)
@@ -119,22 +120,31 @@ class TD7:
         optimizer.step()
 
 
-def main(observation_size: str, action_size: str, seed: str) -> None:
+def main(observation_size: str, action_size: str, device: str, seed: str) -> None:
     observations, actions = int(observation_size), int(action_size)
     torch.manual_seed(int(seed))
-    agent = TD7(observations, actions)
-    batch = (
-        torch.randn(BATCH, observations),
-        torch.tanh(torch.randn(BATCH, actions)),
-        torch.randn(BATCH, 1),
-        torch.randn(BATCH, observations),
-        torch.ones(BATCH, 1),
-    )
-    agent.update(*batch)
+    agent = TD7(observations, actions, device)
+    batch = [
+        tensor.to(device)
+        for tensor in (
+            torch.randn(BATCH, observations),
+            torch.tanh(torch.randn(BATCH, actions)),
+            torch.randn(BATCH, 1),
+            torch.randn(BATCH, observations),
+            torch.ones(BATCH, 1),
+        )
+    ]
+
+    def update(times: int) -> None:
+        for _ in range(times):
+            agent.update(*batch)
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    update(1)
     print("ready", flush=True)
     for line in sys.stdin:
-        for _ in range(int(line)):
-            agent.update(*batch)
+        update(int(line))
         print("done", flush=True)
 
 
