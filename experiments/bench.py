@@ -40,10 +40,11 @@ from experiments.measure import (
     why,
 )
 from experiments.measure_checkpoints import bench_checkpoint
+from experiments.measure_memory import bench_memory
 from sqt_jax import algorithms, envs
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # what is measured if nothing is said
-MORE_SUITES = ("growth",)
+MORE_SUITES = ("growth", "memory")
 # Command lines by name: flags of this program, which those that are given win over.
 NAMED: dict[str, dict[str, Any]] = {
     "gpu": {
@@ -61,14 +62,14 @@ flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES +
 flags.DEFINE_enum("suite", None, list(NAMED), "Flags by name, which those that are given win over.")
 PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
 flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
-flags.DEFINE_list("physics", None, "Physics of the suites env and loop; by itself all that can run here.")
+flags.DEFINE_list("physics", None, "Physics of the suites env, loop and memory; by itself all that can run here.")
 flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
-flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update and loop.")
+flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop and memory.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list(
     "devices", ["1"], "Devices that the suites update and loop spread their members over: numbers, or all."
 )
-flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suite replay.")
+flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suites replay and memory.")
 flags.DEFINE_boolean("profile", False, "Also count and time what the suite loop runs on the device.")
 flags.DEFINE_string("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list("compare", [], f"Peers to measure beside ours, in turns: {', '.join(compare.NEEDS)}.")
@@ -168,6 +169,9 @@ def parts(
         elif suite == "replay":
             for kind, what, size in itertools.product(REPLAYS, ("insert", "sample"), map(int, FLAGS.capacities)):
                 yield f"replay: {kind} {what}", bench_replay(kind, what, tasks[0], size, count, **timing)
+        elif suite == "memory":
+            for algo, task, name, size in itertools.product(algos, tasks, physics, map(int, FLAGS.capacities)):
+                yield f"memory: {algo} on {task}, {name}", bench_memory(algo, task, count, size, name)
         elif suite == "checkpoint":
             for algo, task in itertools.product(algos, tasks):
                 yield f"checkpoint: {algo}, {task}", bench_checkpoint(algo, task, count, timing["repeats"])
@@ -226,8 +230,7 @@ def cells(row: Row, peak: float) -> tuple[str, ...]:
     peak *= 1 if jax.default_backend() == "cpu" else row.devices  # of one device; a CPU's have the same cores
     share = f"{row.rate * row.operations / peak:.0%}" if row.operations and peak else ""
     profiled = f"{sum(kind.number for kind in row.kinds):,.0f}" if row.kinds else ""
-    rate = f"{row.rate:,.0f}"
-    return (row.suite, row.what, str(row.members), rate, f"{row.unit}/s", compiled, counted, share, profiled)
+    return (row.suite, row.what, str(row.members), *row.figure, compiled, counted, share, profiled)
 
 
 def markdown(all_rows: Sequence[Row], peak: float) -> str:
@@ -239,7 +242,7 @@ def tell(found: Row | Failure) -> None:
     if isinstance(found, Failure):
         print(f"failed: {found.what}: {found.why}", flush=True)
         return
-    print(f"{found.suite}: {found.what}, {found.members} members: {found.rate:,.0f} {found.unit}/s", flush=True)
+    print(f"{found.suite}: {found.what}, {found.members} members: {' '.join(found.figure)}", flush=True)
     if found.kinds is not None:
         print(f"  {kernels.told(found.kinds, found.members / found.rate)}", flush=True)
 

@@ -29,6 +29,7 @@ from sqt_jax.ring import Ring
 from sqt_jax.types import Array, Transition
 
 BATCH = 256
+MEGABYTES = "MB"
 NO_SETTINGS: Mapping[str, Any] = MappingProxyType({})
 LOOP_ROWS = 1_000_000  # of the replays of all members together, where a loop is measured
 LARGE = 8e9  # bytes on the device, of loops that are measured in turns: what takes more is measured one after the other
@@ -49,6 +50,11 @@ class Row:
     devices: int = 1
     kinds: tuple[kernels.Kind, ...] | None = None  # what runs on the device, of a lockstep step; None: not profiled
     point: tuple[str, str, int] | None = None  # in a figure of growth: what is varied, the line, the value
+
+    @property
+    def figure(self) -> tuple[str, str]:
+        """The rate and its unit as they are shown; memory is no rate."""
+        return f"{self.rate:,.0f}", self.unit if self.unit == MEGABYTES else f"{self.unit}/s"
 
 
 class Failure(NamedTuple):

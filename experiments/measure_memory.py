@@ -7,6 +7,7 @@ import multiprocessing
 import resource
 import sys
 import tempfile
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -17,10 +18,12 @@ import jax.numpy as jnp
 from experiments import runtime
 from experiments.checkpoints import Checkpoints
 from experiments.loop import Position
-from experiments.measure import member_keys
+from experiments.measure import MEGABYTES, Row, member_keys
 from sqt_jax import algorithms, envs, train
+from sqt_jax.config import Config
 from sqt_jax.members import Layout
 
+STEPS = 1_000_000  # as a run has by itself
 SAVED = 25_000  # rows of a checkpoint: the default interval's
 
 
@@ -28,23 +31,30 @@ class Memory(NamedTuple):
     """Bytes."""
 
     started: int  # the process with all that it imports, before the first array
-    highest: int  # afterwards, at any time: compilation, warm-up, training, evaluation, a checkpoint
-    device_highest: int | None  # of the accelerator, if there is one
-    estimate: int  # what a run says before it begins
-    replay: int  # of it the replay
+    highest: int  # at any time: compilation, warm-up, training, evaluation, a checkpoint
+    on_device: int | None  # the same of an accelerator, where there is one
+    estimate: int  # of the replay and the agents, which a run makes before it begins
+    replay: int
 
 
-def measure_memory(algo: str, task: str, members: int, capacity: int, physics: str) -> Memory:
-    """All that a run does, once, in a process of its own."""
+def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str) -> Iterator[Row]:
+    """The process's memory at its height, and what it consists of; an accelerator's in a row of its own."""
+    config = algorithms.make_config(algo, task, physics=physics, steps=max(STEPS, capacity), replay_capacity=capacity)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_measured, algo, task, members, capacity, physics).result()
+        found = pool.submit(_measured, config, members).result()
+    case = f"{algo} on {task}, {physics}, capacity {capacity:,}"
+    parts = {"before the first array": found.started, "replay": found.replay, "estimate": found.estimate}
+    told = ", ".join(f"{name} {size / 1e6:,.0f}" for name, size in parts.items())
+    yield Row("memory", f"{case}: at most ({told})", members, MEGABYTES, found.highest / 1e6)
+    if found.on_device:
+        yield Row("memory", f"{case}: at most on the device", members, MEGABYTES, found.on_device / 1e6)
 
 
-def _measured(algo: str, task: str, members: int, capacity: int, physics: str) -> Memory:
+def _measured(config: Config, members: int) -> Memory:
     runtime.prepare()
     started = _highest()
-    config = algorithms.make_config(algo, task, replay_capacity=capacity, physics=physics)
-    trainer, replay = algorithms.make_trainer(config), algorithms.replay_of(config, envs.make(task, physics))
+    trainer = algorithms.make_trainer(config)
+    replay = algorithms.replay_of(config, envs.make(config.env, config.physics))
     sweep = train.make_sweep(trainer)
     state = sweep.init(member_keys(members), jax.tree.map(lambda x: jnp.full(members, x), config.agent.scalars()))
     rows = sum(leaf.nbytes for leaf in jax.tree.leaves(state.replay))
@@ -53,7 +63,7 @@ def _measured(algo: str, task: str, members: int, capacity: int, physics: str) -
     jax.block_until_ready(sweep.evaluate(state))
     with tempfile.TemporaryDirectory() as folder:
         store = Checkpoints(Path(folder), replay, Layout(members), 2, print)
-        store.save(state, Position(min(SAVED, capacity), 0), {})
+        store.save(state, Position(min(SAVED, replay.capacity), 0), {})
         store.wait()
         state = sweep.advance(state, 4, True)
     jax.block_until_ready(state.env_steps)
@@ -61,7 +71,7 @@ def _measured(algo: str, task: str, members: int, capacity: int, physics: str) -
     return Memory(
         started=started,
         highest=_highest(),
-        device_highest=on_device.get("peak_bytes_in_use"),
+        on_device=on_device.get("peak_bytes_in_use"),
         estimate=algorithms.memory_estimate(config, members),
         replay=rows,
     )
@@ -70,12 +80,3 @@ def _measured(algo: str, task: str, members: int, capacity: int, physics: str) -
 def _highest() -> int:
     unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def told(memory: Memory) -> str:
-    """One line."""
-    device = f", on the device {memory.device_highest / 1e6:,.0f}" if memory.device_highest else ""
-    return (
-        f"{memory.highest / 1e6:,.0f} MB at most, of which {memory.started / 1e6:,.0f} before the first array{device}; "
-        f"the replay's {memory.replay / 1e6:,.0f}, estimated before the run {memory.estimate / 1e6:,.0f}"
-    )
