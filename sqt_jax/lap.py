@@ -38,10 +38,6 @@ def priority(td_error: Array, exponent: float, min_priority: float) -> Array:
 
 def set_priorities(levels: tuple[Array, ...], index: Array, value: Array) -> tuple[Array, ...]:
     """The priorities `value [B]` for the rows `index [B]`, and the sums above them."""
-    if index.shape[0] == 1:
-        # A scatter of one row becomes a slice update, which XLA computes again where the sum is taken: it would keep
-        # a copy of the level for that. Two rows stay a scatter, in place.
-        index, value = jnp.repeat(index, 2), jnp.repeat(value, 2)
     changed = []
     for level in levels:
         block, place = index // BLOCK, index % BLOCK
@@ -80,6 +76,7 @@ def lap(
     """A buffer that samples in proportion to max(|td_error|, min_priority)^priority_exponent.
 
     New rows get the largest priority seen; every `refresh_every` updates that becomes the largest in the buffer.
+    Transitions that have lost their final observation (`Ring`) are drawn no more, older ones are.
     """
 
     def init() -> LapState:
@@ -90,7 +87,7 @@ def lap(
         rows, lost = ring.insert(state.rows, transition)
         new = state.rows.inserted % ring.capacity + jnp.arange(ring.num_envs)
         # A transition without its final observation is drawn no more; where there is none, a new row is set twice.
-        gone = lost >= rows.inserted - ring.capacity
+        gone = lost >= jnp.maximum(rows.inserted - ring.capacity, 0)
         index = jnp.concatenate([new, jnp.where(gone, lost % ring.capacity, new)])
         value = jnp.where(jnp.concatenate([jnp.zeros_like(gone), gone]), 0.0, state.max_priority)
         return LapState(rows, set_priorities(state.levels, index, value), state.max_priority)
@@ -101,8 +98,9 @@ def lap(
 
     def feedback(state: LapState, index: Array, td_error: Array, gradient_steps: Array) -> LapState:
         new = priority(td_error, priority_exponent, min_priority)
-        levels = set_priorities(state.levels, index, new)
         highest = jnp.maximum(state.max_priority, jnp.max(new))
+        there = state.levels[0][index // BLOCK, index % BLOCK] > 0  # not lost since it was drawn
+        levels = set_priorities(state.levels, index, jnp.where(there, new, 0.0))
         # A scalar that members share: a real branch under vmap, taken rarely, since it reads every priority.
         refresh = gradient_steps % refresh_every == 0
         highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
@@ -117,4 +115,7 @@ def lap(
     def without_rows(state: LapState) -> LapState:
         return state._replace(rows=ring.without_rows(state.rows))
 
-    return Replay(ring.capacity, init, insert, sample, feedback, rows, with_rows, without_rows)
+    def size(state: LapState) -> Array:
+        return ring.size(state.rows)
+
+    return Replay(ring.capacity, init, insert, sample, feedback, size, rows, with_rows, without_rows)

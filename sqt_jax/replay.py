@@ -20,4 +20,6 @@ def uniform(ring: Ring, batch_size: int) -> Replay:
     def feedback(state: RingState, index: Array, td_error: Array, gradient_steps: Array) -> RingState:
         return state  # every transition stays as likely as any other
 
-    return Replay(ring.capacity, ring.init, insert, sample, feedback, ring.rows, ring.with_rows, ring.without_rows)
+    return Replay(
+        ring.capacity, ring.init, insert, sample, feedback, ring.size, ring.rows, ring.with_rows, ring.without_rows
+    )

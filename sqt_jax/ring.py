@@ -40,7 +40,8 @@ class Ring(NamedTuple):
       capacity: transitions, a multiple of `num_envs`.
       num_envs: E, transitions that are inserted at once, one per environment.
       shortest_episode: steps that episodes take at least, in the mean over a full ring. Room for final observations is
-        made for these; where episodes are shorter, the oldest transitions are given up before their rows are.
+        made for these; where episodes are shorter, the oldest transitions are given up before their rows are. With 1
+        none ever is, and nothing is saved.
     """
 
     capacity: int
@@ -109,6 +110,10 @@ class Ring(NamedTuple):
     def oldest(self, state: RingState) -> Array:
         """The number of the first of the transitions that are all still there: []"""
         return jnp.maximum(state.inserted - self.capacity, state.whole_from)
+
+    def size(self, state: RingState) -> Array:
+        """How many these are: []"""
+        return state.inserted - self.oldest(state)
 
     def read(self, state: RingState, index: Array) -> Transition:
         """The transitions in rows `index [B]`."""

@@ -189,6 +189,7 @@ def make_trainer(
                 "train_return": episodes.ended_return / episodes.ended,  # 0 / 0 = NaN: no episode ended
                 "train_length": episodes.ended_length / episodes.ended,
                 "train_episodes": episodes.ended,
+                "replay_rows": replay.size(state.replay),
             }
         )
 

@@ -101,6 +101,7 @@ class Replay(NamedTuple):
     insert: Callable[[State, Transition], State]  # E new transitions at once
     sample: Callable[[State, Array], tuple[Transition, Array]]  # (state, key) -> B transitions, their rows [B]
     feedback: Callable[[State, Array, Array, Array], State]  # (state, rows [B], td_error [B], gradient_steps) -> state
+    size: Callable[[State], Array]  # state -> [] int32: the newest transitions that are all there
     rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows to keep on disk [count, floats]
     with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state: they are back
     without_rows: Callable[[State], State]  # state -> what else is to be kept: None for the arrays of the rows

@@ -23,6 +23,11 @@ def one_step() -> Environment:
     return make_environment("one_step", 1, 1, 10, start, advance)
 
 
+def shorter_than_it_says() -> Environment:
+    """`one_step`, whose replay has room for the final observations of longer episodes."""
+    return one_step()._replace(shortest_episode=8)
+
+
 def constant_reward(episode_length: int = 5) -> Environment:
     """Reward 1 for ever; episodes end by the time limit alone, so Q = 1 / (1 - gamma) everywhere."""
 

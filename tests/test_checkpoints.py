@@ -27,10 +27,10 @@ LENGTHS = {"evaluations": 10, "metrics": 20}
 class Case:
     """A small sweep, and states of it."""
 
-    def __init__(self, algo="td3_sqt", devices=1, **settings):
+    def __init__(self, algo="td3_sqt", devices=1, make_env=probe_envs.one_step, **settings):
         small = {"embedding_size": 16} if ALGORITHMS[algo].assessed else {}
-        self.config, trainer, self.sweep = make(algo, replay_capacity=CAPACITY, **small, **settings)
-        self.replay = replay_of(self.config, probe_envs.one_step())
+        self.config, trainer, self.sweep = make(algo, make_env, replay_capacity=CAPACITY, **small, **settings)
+        self.replay = replay_of(self.config, make_env())
         self.template = jax.eval_shape(lambda: start(self.config, self.sweep))
         self.layout = Layout(len(SEEDS), tuple(jax.local_devices()[:devices]))
         if devices > 1:
@@ -298,6 +298,17 @@ def test_several_environments_per_member_fill_the_ring_side_by_side(tmp_path):
     restored = case.store(tmp_path).restore(case.template)
     assert same(restored.state, state)
     assert same(case.sweep.advance(restored.state, 5, True), case.sweep.advance(state, 5, True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["td3", "td7"])
+def test_transitions_that_lost_their_final_observations_stay_lost(algo, tmp_path):
+    case = Case(algo, make_env=probe_envs.shorter_than_it_says)
+    state = case.saved(case.store(tmp_path), 50, 130)
+    assert np.all(case.replay.size(state.replay) == 1 + 64 / 8 + 1)  # the newest one's needs no room
+    restored = case.store(tmp_path).restore(case.template)
+    assert same(restored.state, state)
+    assert same(case.advance(restored.state, 30, True), case.advance(state, 30, True))
 
 
 def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):

@@ -315,6 +315,9 @@ def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
         newest = np.arange(step * num_envs)[-room - num_envs :]
         expected[newest % 40] = 1
         assert_levels_agree(state.levels, expected)
+    gone = np.flatnonzero(expected == 0)[:BATCH]
+    after = compiled(num_envs, capacity=40, shortest_episode=10)[3](state, gone, np.full(BATCH, 32.0), jnp.int32(1))
+    assert_levels_agree(after.levels, expected)  # also of one that was lost since it was drawn
 
 
 # Cost

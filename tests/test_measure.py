@@ -91,10 +91,10 @@ def test_mujoco_alone_steps_with_and_without_contact_forces(task, monkeypatch):
 
 
 def test_an_updates_row_counts_the_updates_of_all_members():
-    (row,) = measure.bench_updates("td7_sqt", "cheetah", 2, **SHORT)
-    assert (row.suite, row.what, row.members) == ("update", "td7_sqt, cheetah sizes", 2)
+    (row,) = measure.bench_updates("td3_sqt", "cheetah", 2, **SHORT)
+    assert (row.suite, row.what, row.members) == ("update", "td3_sqt, cheetah sizes", 2)
     assert row.unit == "member updates" and row.rate > 0
-    assert 2e9 < row.operations < 3e9
+    assert 4e8 < row.operations < 5e8
 
 
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")

@@ -10,7 +10,7 @@ import numpy as np
 import probe_envs
 import pytest
 
-from sqt_jax import algorithms, train
+from sqt_jax import algorithms, envs, train
 from sqt_jax.agents import critic
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.members import member_axes
@@ -104,6 +104,20 @@ def test_diverged_physics_are_counted_and_never_reach_the_replay():
     assert last.size and set(last.ravel()) <= set(rows[..., 0].ravel())  # this task's state never changes
     state, metrics = advance(sweep, state, 30, True)
     assert np.isfinite(metrics["critic_loss"]).all() and np.isfinite(state.replay.storage).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics", ["mujoco", "mjx"])
+@pytest.mark.parametrize("task", envs.TASKS)
+def test_a_final_observation_is_kept_for_each_episode_and_no_other_step(task, physics):
+    """Were an episode's next observations not the same numbers in both places, each would take room."""
+    settings = {"hidden": (8, 8), "batch_size": 8, "steps": 1_200, "warmup_steps": 1_100, "physics": physics}
+    config = algorithms.make_config("td3", task, **settings)
+    sweep = train.make_sweep(algorithms.make_trainer(config))
+    state, metrics = advance(sweep, start(config, sweep, (0, 1)), 1_020, False)
+    over = state.timestep.terminated | state.timestep.truncated
+    np.testing.assert_array_equal(state.replay.ended, metrics["train_episodes"] - over.sum(axis=1))
+    assert np.all(metrics["train_episodes"] >= 1) and np.all(metrics["replay_rows"] == 1_020)
 
 
 def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):

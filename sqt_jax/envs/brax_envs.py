@@ -36,6 +36,8 @@ NAMES = tuple(
 PIPELINES = ("mjx", "generalized", "spring", "positional")
 ONLY = {"brax:swimmer": ("generalized",)}  # Brax gives it no others
 EPISODE_LENGTH = 1000  # as in Brax's training configurations
+FALLING = {"brax:ant", "brax:hopper", "brax:humanoid", "brax:walker2d"}
+PENDULUMS = {"brax:inverted_pendulum", "brax:inverted_double_pendulum"}  # they fall in two steps; the others never do
 
 
 def pipelines(name: str) -> tuple[str, ...]:
@@ -57,8 +59,9 @@ def make_brax(name: str, physics: str) -> Environment:
             state = _strong(env.step(state, action))
         return state, state.obs, state.reward, state.done > 0
 
+    shortest = SHORTEST_FALL if name in FALLING else 1 if name in PENDULUMS else EPISODE_LENGTH
     sizes = env.observation_size, env.action_size, EPISODE_LENGTH
-    return make_environment(name, *sizes, start, advance, shortest_episode=SHORTEST_FALL)
+    return make_environment(name, *sizes, start, advance, shortest_episode=shortest)
 
 
 def brax_own(name: str, physics: str) -> Any:
