@@ -154,6 +154,9 @@ def test_the_replay_is_lap_for_td7_alone_with_the_agents_settings(algo):
     state = buffer.init()
     assert isinstance(state, lap.LapState)
     rows = jnp.arange(2)
+    one = Transition(*(jnp.zeros((1, size)) for size in (2, 1)), jnp.zeros(1), jnp.zeros((1, 2)), jnp.ones(1))
+    for _ in rows:
+        state = buffer.insert(state, one)
     state = buffer.feedback(state, rows, jnp.array([0.0, 25.0]), jnp.int32(1))
     assert state.levels[0][0, :2].tolist() == [2, 5]  # max(error, 4) ** 0.5
     state = buffer.feedback(state, rows, jnp.zeros(2), jnp.int32(2))

@@ -50,7 +50,8 @@ def test_a_run_leaves_its_files(finished):
     assert not any(name.endswith(".part") for name in names)
 
 
-@pytest.mark.parametrize("preset", ["paper", pytest.param("released", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "released"])
 def test_td7_tells_of_its_checkpoints(preset, tmp_path):
     """TD7's state and metrics are unlike the others': a whole run of it."""
     more = ("--algo=td7_sqt", "--embedding_size=8", f"--preset={preset}", "--policy_delay=2")

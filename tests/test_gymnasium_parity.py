@@ -29,7 +29,7 @@ def name(request):
 
 
 # They observe what the humanoid does, or less: compiling that takes longest of all.
-LARGE = ("humanoid_standup", "humanoid-v5", "humanoid_standup-v5", "ant-v5")
+LARGE = ("humanoid", "humanoid_standup", "humanoid-v5", "humanoid_standup-v5", "ant-v5")
 
 
 @pytest.mark.parametrize("name", [pytest.param(t, marks=pytest.mark.slow) if t in LARGE else t for t in TASKS])

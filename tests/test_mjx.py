@@ -162,7 +162,7 @@ def equations(jaxpr, primitive):
                     yield from equations(inner, primitive)
 
 
-@pytest.mark.parametrize("name", MJX_TASKS)
+@pytest.mark.parametrize("name", [*MJX_TASKS, pytest.param("humanoid", marks=pytest.mark.slow)])
 def test_first_state_is_at_rest_of_forces(name):
     timestep = placed(name)
     forces = {k: v for k, v in timestep.state.task.quantities.items() if k in ("qfrc_actuator", "cfrc_ext")}

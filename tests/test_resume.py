@@ -36,6 +36,7 @@ def whole(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
 def test_a_run_goes_on_on_another_number_of_devices(tmp_path):
     assert run(tmp_path, *MEMBERS, "--steps=80", "--devices=2") == 0
@@ -122,7 +123,7 @@ def test_a_finished_run_is_gone_on_with_for_more_steps(tmp_path):
     config = json.loads((path / "config.json").read_text())
     assert (config["settings"]["steps"], config["replay_rows"]) == (200, 120)
     assert result_of(path)["rows"].shape[1] == 120
-    assert int(result_of(path)["replay/size"]) == 120
+    assert int(result_of(path)["replay/inserted"]) == 200
     # And again, with the number of steps that it has by now.
     assert resume(tmp_path, "--steps=200") == 0
 

@@ -210,7 +210,7 @@ def test_a_seed_trains_alone_as_in_a_sweep(algo):
         np.testing.assert_allclose(alone[0], together[3], rtol=1e-4, atol=1e-6)
 
 
-@algorithm_rows.every(PENALISED, fast=("td3_sqt", "td3_sqt_tuple"))
+@algorithm_rows.every(PENALISED, fast=("td3_sqt_tuple",))
 def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(algo):
     plain = algo.removesuffix("_tuple").removesuffix("_sqt")
     trained = {}
