@@ -167,7 +167,8 @@ def made_trace(name: str, **sizes) -> dict:
 SIZES = {"ensemble_size": 3, "hidden": (12, 9), "penalty_coef": 0.3, "gamma": 0.9}
 
 
-@pytest.mark.parametrize("name", ["td3_sqt", slow("sac_sqt_tuple"), slow("td7_sqt_tuple")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["td3_sqt", "sac_sqt_tuple", "td7_sqt_tuple"])
 def test_sizes_and_settings_are_those_of_the_file(name, tmp_path):
     more = {"embedding_size": 6, "target_update_period": 2} if name.startswith("td7") else {"tau": 0.1}
     np.savez(tmp_path / f"{name}.npz", **made_trace(name, **SIZES, **more))

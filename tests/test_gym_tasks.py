@@ -1,5 +1,6 @@
 """The pieces of the locomotion tasks by hand; whole steps are compared in test_gymnasium_parity."""
 
+import itertools
 import sys
 import types
 
@@ -8,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.gymnasium_reference import gymnasium_environment
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
+from sqt_jax.envs.autoreset import SHORTEST_FALL
 from sqt_jax.envs.physics import PHYSICS, Physics, PhysicsState
 
 
@@ -201,3 +204,22 @@ def test_models_load_without_a_log_file(tmp_path, monkeypatch, capfd):
     gym_tasks.load_model(TASKS["cheetah"])
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["hopper", "walker", "ant", "humanoid"])
+def test_no_constant_action_at_its_limits_makes_a_robot_fall_sooner_than_the_replay_has_room_for(name):
+    """All corners, or sixty-four at random where there are more; with mean lengths over three starts."""
+    env = gymnasium_environment(name)
+    low, high = env.model.actuator_ctrlrange.T
+    generator, size = np.random.default_rng(0), env.model.nu
+    every = itertools.product([0, 1], repeat=size) if size <= 6 else generator.integers(0, 2, (64, size))
+    lengths = {}
+    for corner in every:
+        action, steps = np.where(corner, high, low), 0
+        for seed in range(3):
+            env.reset(seed=seed)
+            steps += next((step for step in range(1, 31) if env.step(action)[2]), 30)
+        lengths[tuple(corner)] = steps / 3
+    shortest = min(lengths.values())
+    assert shortest >= SHORTEST_FALL
+    assert name not in ("hopper", "walker") or shortest < 7  # it is a tight one

@@ -97,6 +97,7 @@ def test_an_updates_row_counts_the_updates_of_all_members():
     assert 4e8 < row.operations < 5e8
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
 def test_an_update_is_measured_on_each_number_of_devices_that_has_members():
     settings = {"hidden": (16, 16), "batch_size": 16}

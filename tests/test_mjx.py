@@ -48,7 +48,7 @@ def test_mujoco_and_mjx_are_the_same_version():
     assert version("mujoco") == version("mujoco-mjx")
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize("integrator", [pytest.param("Euler", marks=pytest.mark.slow), "RK4"])
 def test_both_integrators_follow_mujoco_in_free_flight(integrator):
     model = model_of(integrator)
     physics = mjx.make(Setup(model, 5, tracked=lambda model, data: data.xpos[1, 0]))

@@ -37,7 +37,8 @@ PIPELINES = ("mjx", "generalized", "spring", "positional")
 ONLY = {"brax:swimmer": ("generalized",)}  # Brax gives it no others
 EPISODE_LENGTH = 1000  # as in Brax's training configurations
 FALLING = {"brax:ant", "brax:hopper", "brax:humanoid", "brax:walker2d"}
-PENDULUMS = {"brax:inverted_pendulum", "brax:inverted_double_pendulum"}  # they fall in two steps; the others never do
+PENDULUMS = {"brax:inverted_pendulum", "brax:inverted_double_pendulum"}  # a push is enough: two steps
+# The other tasks never terminate.
 
 
 def pipelines(name: str) -> tuple[str, ...]:
