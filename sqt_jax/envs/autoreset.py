@@ -25,8 +25,8 @@ from sqt_jax.rarely import rarely
 from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
 
 LARGEST = 1e10  # MuJoCo's own limit (mjMAXVAL): beyond it, a simulation has diverged
-# Fewer steps than a robot that may fall needs for it: by the worst constant action at their limits, hopper and walker do
-# in six (tests/test_gym_tasks.py).
+# Fewer steps than a robot that may fall needs for it: by the worst constant action at their limits, hopper and walker
+# do in six (tests/test_gym_tasks.py).
 SHORTEST_FALL = 5
 
 Start = Callable[[Array], tuple[State, Array]]
