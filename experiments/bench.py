@@ -52,7 +52,7 @@ NAMED: dict[str, dict[str, Any]] = {
         "algos": ["td3", "td7"],
         "tasks": ["ant", "humanoid"],
         "members": ["5", "64", "512"],
-        "devices": ["1", "all"],
+        "devices": ["1", "auto"],
         "profile": True,
     },
     "growth": {"suites": ["growth"], "tasks": ["cheetah"], "members": ["5"]},
@@ -67,7 +67,9 @@ flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite phy
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop and memory.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list(
-    "devices", ["1"], "Devices that the suites update and loop spread their members over: numbers, or all."
+    "devices",
+    ["auto"],
+    "Devices that the suites update and loop spread their members over: numbers, or auto, as a run.",
 )
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suites replay and memory.")
 flags.DEFINE_boolean("profile", False, "Also count and time what the suite loop runs on the device.")
@@ -97,7 +99,7 @@ def check_flags() -> None:
                 sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
     for name in ("members", "devices", "capacities"):
         for value in getattr(FLAGS, name):
-            if not (value.isdecimal() and int(value)) and (name, value) != ("devices", "all"):
+            if not (value.isdecimal() and int(value)) and (name, value) != ("devices", "auto"):
                 sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
     solver_limits()
     if "growth" in FLAGS.suites and len(FLAGS.members) != 1:
@@ -130,13 +132,13 @@ def physics_here() -> list[str]:
     return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
 
 
-def devices_here() -> list[int]:
-    """--devices, `all` as how many there are; leaves with one line where one is more."""
+def devices_here() -> list[int | None]:
+    """--devices, `auto` as None; leaves with one line where one is more than there are."""
     here = len(jax.local_devices())
-    counts = [here if value == "all" else int(value) for value in FLAGS.devices]
-    if max(counts) > here:
-        sys.exit(f"--devices: takes at most {here} here, not {max(counts)}")
-    return list(dict.fromkeys(counts))
+    counts = [None if value == "auto" else int(value) for value in FLAGS.devices]
+    if most := max((count for count in counts if count and count > here), default=None):
+        sys.exit(f"--devices: takes at most {here} here, not {most}")
+    return counts
 
 
 def rows(
@@ -280,6 +282,8 @@ def main(argv: Sequence[str]) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     environment = dict(os.environ)  # before our own options for XLA are in it
     runtime.prepare()
+    numbers = [value for value in FLAGS.members + FLAGS.devices if value != "auto"]
+    runtime.divide_processor(max(map(int, numbers)))  # as a run of so many members does
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
     devices_here()

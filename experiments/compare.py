@@ -20,6 +20,7 @@ from experiments.measure import Case, Failure, Made, Row, in_turns, loop_steps, 
 from sqt_jax import envs
 from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table
+from sqt_jax.members import usable_devices
 
 PEERS = Path(__file__).parent / "peers"
 # What a peer's programs import, by which it is known to be there.
@@ -184,13 +185,14 @@ def compare(
 
     if peer == "sbx":
         program, arguments = "sbx_loop.py", [algo, gym_table.TASKS[task].gymnasium_id]
-        loops = {name: functools.partial(loop_steps, algo, task, members, name) for name in physics}
+        devices = usable_devices(members)  # as a run
+        loops = {name: functools.partial(loop_steps, algo, task, members, name, devices) for name in physics}
         ours = [Case(row(f"sqt_jax, {name}", members), make) for name, make in loops.items()]
     else:
         env = envs.make(task)
         device = "cpu" if jax.default_backend() == "cpu" else "cuda"  # as ours
         program, arguments = "torch_td7.py", [str(env.observation_size), str(env.action_size), device]
-        ours = [Case(row("sqt_jax", members), functools.partial(updates, algo, task, members))]
+        ours = [Case(row("sqt_jax", members), functools.partial(updates, algo, task, members, usable_devices(members)))]
     counts = ways(members)
     rests = {members % count for count in counts} - {0}
     rates: dict[int, float] = {}

@@ -24,7 +24,7 @@ from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.config import Config
 from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
-from sqt_jax.members import Layout, member_axes
+from sqt_jax.members import Layout, member_axes, usable_devices
 from sqt_jax.ring import Ring
 from sqt_jax.types import Array, Transition
 
@@ -212,7 +212,7 @@ def bench_updates(
     algo: str,
     task: str,
     members: int,
-    devices: Sequence[int] = (1,),
+    devices: Sequence[int | None] = (1,),
     settings: Mapping[str, Any] = NO_SETTINGS,
     **timing: Any,
 ) -> Iterator[Row | Failure]:
@@ -231,11 +231,12 @@ def _on(what: str, devices: int) -> str:
     return f"{what}, {devices} devices" if devices > 1 else what
 
 
-def fitting(devices: Sequence[int], members: int) -> list[int]:
-    """Those numbers of devices that have a member for each; a line says so where none has."""
-    found = [count for count in devices if count <= members]
+def fitting(devices: Sequence[int | None], members: int) -> list[int]:
+    """Those numbers of devices that have a member for each, None as a run chooses; a line says so where none has."""
+    chosen = [usable_devices(members) if count is None else count for count in devices]
+    found = [count for count in dict.fromkeys(chosen) if count <= members]
     if not found:
-        numbers = " or ".join(map(str, devices))
+        numbers = " or ".join(map(str, chosen))
         print(f"no figure of {members} members on {numbers} devices: each takes one at least", flush=True)
     return found
 
@@ -336,7 +337,7 @@ def bench_loops(
     task: str,
     members: int,
     physics: Sequence[str],
-    devices: Sequence[int] = (1,),
+    devices: Sequence[int | None] = (1,),
     profiled: bool = False,
     **timing: Any,
 ) -> Iterator[Row | Failure]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import psutil
 
-from experiments import described, flags, records, resume
+from experiments import described, flags, records, resume, runtime
 from experiments.described import Described, Member
 from experiments.presets import preset_settings
 from sqt_jax import envs
@@ -87,6 +87,7 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
             make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
+        runtime.divide_processor(len(configs) * len(options.seeds))
         check_physics(configs[0])
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
@@ -119,6 +120,7 @@ def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Des
         except ValueError as error:
             raise flags.UsageError(f"--env: {error}") from None
     run = resume.named(path, wanted)
+    runtime.divide_processor(len(run.members))
     return resume.with_its_replay(run), run.swept, path, run
 
 

@@ -1,4 +1,4 @@
-"""What a process sets before JAX starts: the cache of compiled programs, one XLA option, a device for each core."""
+"""What a process sets before JAX starts: the cache of compiled programs, one XLA option, the processor's devices."""
 
 import os
 from contextlib import suppress
@@ -10,6 +10,8 @@ from sqt_jax.cores import usable_cores
 # whose many small kernels are then dispatched one by one.
 SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 SMALL_LOOP_BYTES = 1_000_000
+
+DEVICES_PER_CORE = 16
 
 
 def cache_directory() -> Path:
@@ -27,8 +29,20 @@ def prepare() -> None:
 
     import jax
 
-    with suppress(RuntimeError):  # JAX has started already, with the devices that it has
-        jax.config.update("jax_num_cpu_devices", usable_cores())
+    divide_processor(usable_cores())
     jax.config.update("jax_compilation_cache_dir", str(cache_directory()))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def divide_processor(devices: int) -> None:
+    """Makes the processor at least so many XLA devices, up to 16 for each core; without effect once JAX has started.
+
+    Devices are threads that need not wait for one another. A sweep with one for each of its members keeps the cores
+    busy, whatever its size, where the operations of a single program leave them idle at the end of each.
+    """
+    import jax
+
+    count = min(max(devices, usable_cores()), DEVICES_PER_CORE * usable_cores())
+    with suppress(RuntimeError):  # it has started, with the devices that it has
+        jax.config.update("jax_num_cpu_devices", count)

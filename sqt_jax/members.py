@@ -77,13 +77,9 @@ class Layout(NamedTuple):
 
 
 def usable_devices(members: int) -> int:
-    """How many of this process's devices a sweep is spread over by itself.
+    """How many of this process's devices a sweep is spread over by itself: as many as give each the smallest share.
 
-    Of accelerators as many as give each the smallest share: with more, some would hold copies alone. Of a processor's
-    cores only as many as share the members evenly: one that waits is lost there, and they work together on a single
-    device too.
+    With more, some would hold copies alone.
     """
     here = len(jax.local_devices())
-    if jax.default_backend() != "cpu":
-        return math.ceil(members / math.ceil(members / here))
-    return max(count for count in range(1, min(here, members) + 1) if members % count == 0)
+    return math.ceil(members / math.ceil(members / here))

@@ -115,8 +115,9 @@ class Stepper:
         self.model = copy.copy(setup.model)
         # A diverged robot is told by its numbers; MuJoCo would put it back to the start and go on.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.data = [mujoco.MjData(self.model) for _ in range(num_threads)]
-        sizes = [self.model.nq, self.model.nv, 1] + [getattr(self.data[0], name).size for name in setup.quantities]
+        # Those that no thread is at work on. Calls come side by side where members lie on several XLA devices.
+        self.idle = [data := mujoco.MjData(self.model)]
+        sizes = [self.model.nq, self.model.nv, 1] + [getattr(data, name).size for name in setup.quantities]
         self.num_measured = sum(sizes)
         self.splits = np.cumsum(sizes)[:-1].tolist()
 
@@ -132,29 +133,41 @@ class Stepper:
         displacement, first_quantity = self.splits[1], self.splits[1] + 1
         numbers = itertools.count()  # of the next row that no thread has taken; its steps are atomic
 
-        def work(thread: int) -> None:
-            model, data = self.model, self.data[thread]
-            for i in numbers:
-                if i >= len(rows):
-                    return
-                row = rows[i]
-                mujoco.mj_setState(model, data, row[1:], STATE)
-                before = row[0]
-                if np.isnan(before):
-                    mujoco.mj_kinematics(model, data)
-                    mujoco.mj_comPos(model, data)
-                    before = self.tracked(data)
-                mujoco.mj_step(model, data, nstep=self.setup.frame_skip)
-                mujoco.mj_getState(model, data, row[1:], STATE)
-                row[0] = self.tracked(data)
-                measured[i, displacement] = row[0] - before
-                if self.setup.quantities:
-                    if "cfrc_ext" in self.setup.quantities:
-                        mujoco.mj_rnePostConstraint(model, data)
-                    fields = [getattr(data, name).ravel() for name in self.setup.quantities]
-                    measured[i, first_quantity:] = np.concatenate(fields)
+        def work() -> None:
+            try:
+                data = self.idle.pop()
+            except IndexError:
+                data = mujoco.MjData(self.model)
+            try:
+                for i in numbers:
+                    if i >= len(rows):
+                        return
+                    advance(i, data)
+            finally:
+                self.idle.append(data)
 
-        _threads(self.num_threads).run(work, min(self.num_threads, len(rows)))
+        def advance(i: int, data: mujoco.MjData) -> None:
+            model, row = self.model, rows[i]
+            mujoco.mj_setState(model, data, row[1:], STATE)
+            before = row[0]
+            if np.isnan(before):
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                before = self.tracked(data)
+            mujoco.mj_step(model, data, nstep=self.setup.frame_skip)
+            mujoco.mj_getState(model, data, row[1:], STATE)
+            row[0] = self.tracked(data)
+            measured[i, displacement] = row[0] - before
+            if self.setup.quantities:
+                if "cfrc_ext" in self.setup.quantities:
+                    mujoco.mj_rnePostConstraint(model, data)
+                fields = [getattr(data, name).ravel() for name in self.setup.quantities]
+                measured[i, first_quantity:] = np.concatenate(fields)
+
+        if len(rows) == 1:
+            work()
+        else:
+            _threads(self.num_threads).run(work, min(self.num_threads, len(rows)))
         with np.errstate(over="ignore"):
             measured[:, :displacement] = rows[:, 1 : 1 + displacement]
         stable = np.all(np.abs(rows) < mujoco.mjMAXVAL, axis=1)
@@ -172,10 +185,10 @@ class _Threads:
         self.lock = threading.Lock()
         self.todo: list[queue.SimpleQueue] = [queue.SimpleQueue() for _ in range(num_threads - 1)]
         for number, todo in enumerate(self.todo, start=1):
-            threading.Thread(target=_serve, args=(number, todo), daemon=True, name=f"mujoco-{number}").start()
+            threading.Thread(target=_serve, args=(todo,), daemon=True, name=f"mujoco-{number}").start()
 
-    def run(self, work: Callable[[int], None], num_threads: int) -> None:
-        """Runs `work(0)` here, `work(1)`.. beside it; raises the first of their errors when all have ended.
+    def run(self, work: Callable[[], None], num_threads: int) -> None:
+        """Runs `work()` here and on `num_threads - 1` others; raises the first of their errors when all have ended.
 
         An interrupt (Ctrl-C) waits for them too: they write into memory that the next call uses.
         """
@@ -184,7 +197,7 @@ class _Threads:
             helpers = self.todo[: num_threads - 1]
             for todo in helpers:
                 todo.put((work, done))
-            errors = [_error_of(work, 0)]
+            errors = [_error_of(work)]
             running = len(helpers)
             while running:
                 try:
@@ -197,15 +210,15 @@ class _Threads:
                 raise error
 
 
-def _serve(number: int, todo: queue.SimpleQueue) -> None:
+def _serve(todo: queue.SimpleQueue) -> None:
     while True:
         work, done = todo.get()
-        done.put(_error_of(work, number))
+        done.put(_error_of(work))
 
 
-def _error_of(work: Callable[[int], None], number: int) -> BaseException | None:
+def _error_of(work: Callable[[], None]) -> BaseException | None:
     try:
-        work(number)
+        work()
     except BaseException as error:
         return error
     return None
