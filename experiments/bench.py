@@ -37,6 +37,7 @@ from experiments.measure import (
     bench_physics,
     bench_replay,
     bench_updates,
+    on,
     why,
 )
 from experiments.measure_checkpoints import bench_checkpoint
@@ -212,13 +213,15 @@ AGAINST = {
 
 def ratios(all_rows: Sequence[Row]) -> list[str]:
     """What these suites are for: each physics against MuJoCo alone, MJX against the file's settings, whole loops."""
-    rates = {(r.suite, r.what, r.members): r.rate for r in all_rows}
+    rates = {(r.suite, r.what, r.members): r for r in all_rows}
     lines = []
-    for (suite, what, members), rate in rates.items():
-        task, _, physics = what.partition(", ")
+    for (suite, what, members), row in rates.items():
+        on_devices = on("", row.devices)
+        task, _, physics = what.removesuffix(on_devices).partition(", ")
         reference = AGAINST.get((suite, physics), "")
-        if other := rates.get((suite, f"{task}, {reference}", members)):
-            lines.append(f"{task}, {members} members: {physics} / {reference} = {rate / other:.2f}")
+        if other := rates.get((suite, f"{task}, {reference}{on_devices}", members)):
+            ratio = row.rate / other.rate
+            lines.append(f"{task}, {members} members{on_devices}: {physics} / {reference} = {ratio:.2f}")
     return lines
 
 
@@ -282,8 +285,10 @@ def main(argv: Sequence[str]) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     environment = dict(os.environ)  # before our own options for XLA are in it
     runtime.prepare()
-    numbers = [value for value in FLAGS.members + FLAGS.devices if value != "auto"]
-    runtime.divide_processor(max(map(int, numbers)))  # as a run of so many members does
+    numbers = [int(value) for value in FLAGS.members + FLAGS.devices if value != "auto"]
+    if "growth" in FLAGS.suites:
+        numbers += growth.MEMBERS
+    runtime.divide_processor(max(numbers))  # as a run of so many members does
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
     devices_here()

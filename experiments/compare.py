@@ -180,19 +180,20 @@ def compare(
       environment: variables of its processes.
     """
 
-    def row(name: str, count: int, rate: float = 0.0) -> Row:
-        return Row("compare", f"{algo} on {task}, {name}", count, UNITS[peer], rate)
+    def row(name: str, count: int, rate: float = 0.0, devices: int = 1) -> Row:
+        return Row("compare", f"{algo} on {task}, {name}", count, UNITS[peer], rate, devices=devices)
 
+    spread = usable_devices(members)  # ours, as those of a run
     if peer == "sbx":
         program, arguments = "sbx_loop.py", [algo, gym_table.TASKS[task].gymnasium_id]
-        devices = usable_devices(members)  # as a run
-        loops = {name: functools.partial(loop_steps, algo, task, members, name, devices) for name in physics}
-        ours = [Case(row(f"sqt_jax, {name}", members), make) for name, make in loops.items()]
+        loops = {name: functools.partial(loop_steps, algo, task, members, name, spread) for name in physics}
+        ours = [Case(row(f"sqt_jax, {name}", members, devices=spread), make) for name, make in loops.items()]
     else:
         env = envs.make(task)
         device = "cpu" if jax.default_backend() == "cpu" else "cuda"  # as ours
         program, arguments = "torch_td7.py", [str(env.observation_size), str(env.action_size), device]
-        ours = [Case(row("sqt_jax", members), functools.partial(updates, algo, task, members, usable_devices(members)))]
+        update = functools.partial(updates, algo, task, members, spread)
+        ours = [Case(row("sqt_jax", members, devices=spread), update)]
     counts = ways(members)
     rests = {members % count for count in counts} - {0}
     rates: dict[int, float] = {}

@@ -12,6 +12,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMetho
 
 from experiments.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
 from experiments.measure import REPLAYS, Case, Failure, Row, in_turns, replay_case, updates
+from sqt_jax.members import usable_devices
 
 MEMBERS = (1, 2, 5, 10, 25, 50)
 CRITICS = (2, 5, 10)
@@ -28,6 +29,8 @@ UNITS = {"members": 1e3, "critics": 1e3, "capacity": 1e6}
 def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterator[Row | Failure]:
     """Updates over members and critics, samples over capacities; `members` where they do not vary.
 
+    Members lie on devices as those of a run do.
+
     The points of a line are measured in turns: a machine that slows down bends none of them.
     """
     for algo in algos:
@@ -41,8 +44,9 @@ def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterat
 def _update(algo: str, task: str, members: int, point: tuple[str, str, int], **settings: int) -> Case:
     varied, _, value = point
     what = f"{algo}, {task} sizes" + (f", {value} critics" if varied == "critics" else "")
-    row = Row("growth", what, members, "member updates", point=point)
-    return Case(row, functools.partial(updates, algo, task, members, **settings))
+    devices = usable_devices(members)
+    row = Row("growth", what, members, "member updates", devices=devices, point=point)
+    return Case(row, functools.partial(updates, algo, task, members, devices, **settings))
 
 
 def _sample(kind: str, task: str, members: int, capacity: int) -> Case:

@@ -219,7 +219,7 @@ def bench_updates(
     """Updates on one fixed batch, on each number of devices in turn: the learner alone."""
     cases = [
         Case(
-            Row("update", f"{algo}, {task} {_on('sizes', count)}", members, "member updates", devices=count),
+            Row("update", f"{algo}, {task} {on('sizes', count)}", members, "member updates", devices=count),
             functools.partial(updates, algo, task, members, count, **settings),
         )
         for count in fitting(devices, members)
@@ -227,7 +227,8 @@ def bench_updates(
     yield from in_turns(cases, **timing)
 
 
-def _on(what: str, devices: int) -> str:
+def on(what: str, devices: int) -> str:
+    """A row's `what` with its number of devices, where these are several."""
     return f"{what}, {devices} devices" if devices > 1 else what
 
 
@@ -348,7 +349,7 @@ def bench_loops(
     counts = fitting(devices, members)
     cases = [
         Case(
-            Row("loop", f"{algo} on {task}, {_on(name, count)}", members, "env steps", devices=count),
+            Row("loop", f"{algo} on {task}, {on(name, count)}", members, "env steps", devices=count),
             functools.partial(loop_steps, algo, task, members, name, count),
         )
         for name in physics

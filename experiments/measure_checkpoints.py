@@ -13,7 +13,7 @@ from experiments.checkpoints import Checkpoints
 from experiments.loop import Position
 from experiments.measure import Row, member_keys
 from sqt_jax import algorithms, envs, train
-from sqt_jax.members import Layout
+from sqt_jax.members import layout_here
 
 FILLED = 100_000  # rows of the replay
 SINCE = 25_000  # of them those that came since the last checkpoint: the default interval
@@ -24,19 +24,20 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     config = algorithms.make_config(algo, task, replay_capacity=FILLED)
     trainer = algorithms.make_trainer(config)
     replay = algorithms.replay_of(config, envs.make(task))
-    sweep = train.make_sweep(trainer)
+    layout = layout_here(members)
+    sweep = train.make_sweep(trainer, layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
     everything, later, waits, size = [], [], [], 0
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
-            store = Checkpoints(Path(folder), replay, Layout(members), 2, print)
+            store = Checkpoints(Path(folder), replay, layout, 2, print)
             save(store, state, FILLED - SINCE)
             waiting, whole = save(store, state, FILLED)
             waits.append(waiting)
             later.append(whole)
         with tempfile.TemporaryDirectory() as folder:
-            everything.append(save(Checkpoints(Path(folder), replay, Layout(members), 2, print), state, FILLED)[1])
+            everything.append(save(Checkpoints(Path(folder), replay, layout, 2, print), state, FILLED)[1])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
     def row(what: str, seconds: list[float]) -> Row:

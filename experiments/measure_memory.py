@@ -21,7 +21,7 @@ from experiments.loop import Position
 from experiments.measure import MEGABYTES, Row, member_keys
 from sqt_jax import algorithms, envs, train
 from sqt_jax.config import Config
-from sqt_jax.members import Layout
+from sqt_jax.members import layout_here
 
 STEPS = 1_000_000  # as a run has by itself
 SAVED = 25_000  # rows of a checkpoint: the default interval's
@@ -52,17 +52,19 @@ def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str
 
 def _measured(config: Config, members: int) -> Memory:
     runtime.prepare()
+    runtime.divide_processor(members)
     started = _highest()
     trainer = algorithms.make_trainer(config)
     replay = algorithms.replay_of(config, envs.make(config.env, config.physics))
-    sweep = train.make_sweep(trainer)
+    layout = layout_here(members)
+    sweep = train.make_sweep(trainer, layout)
     state = sweep.init(member_keys(members), jax.tree.map(lambda x: jnp.full(members, x), config.agent.scalars()))
     rows = sum(leaf.nbytes for leaf in jax.tree.leaves(state.replay))
     state = sweep.advance(state, 300, False)
     state = sweep.advance(state, 4, True)
     jax.block_until_ready(sweep.evaluate(state))
     with tempfile.TemporaryDirectory() as folder:
-        store = Checkpoints(Path(folder), replay, Layout(members), 2, print)
+        store = Checkpoints(Path(folder), replay, layout, 2, print)
         store.save(state, Position(min(SAVED, replay.capacity), 0), {})
         store.wait()
         state = sweep.advance(state, 4, True)

@@ -87,7 +87,7 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
             make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
-        runtime.divide_processor(len(configs) * len(options.seeds))
+        runtime.divide_processor(options.devices or len(configs) * len(options.seeds))  # what follows starts JAX
         check_physics(configs[0])
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
@@ -103,7 +103,7 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
     elif not _exists(path / described.NAME):
         return members, swept, path, None  # so that one command starts a run and goes on with it
     else:
-        run = resume.named(path, wanted)
+        run = resume.named(path, wanted, options.devices)
     return resume.with_its_replay(run), run.swept, path, run
 
 
@@ -119,8 +119,7 @@ def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Des
             wanted["env"] = envs.resolve(options.env)
         except ValueError as error:
             raise flags.UsageError(f"--env: {error}") from None
-    run = resume.named(path, wanted)
-    runtime.divide_processor(len(run.members))
+    run = resume.named(path, wanted, options.devices)
     return resume.with_its_replay(run), run.swept, path, run
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import described, records
+from experiments import described, records, runtime
 from experiments.described import Described, Member
 from experiments.flags import UsageError
 from sqt_jax.algorithms import check_physics
@@ -15,11 +15,12 @@ from sqt_jax.config import ConfigError, check_train
 NOT_COMPARED = {"steps"}
 
 
-def named(path: Path, wanted: Mapping[str, Any]) -> Described:
+def named(path: Path, wanted: Mapping[str, Any], devices: int | None = None) -> Described:
     """The run in the folder `path`, with the number of steps that is `wanted`, if any.
 
     Args:
       wanted: the settings that were given, by name; those that are swept, and `seeds`, as tuples.
+      devices: how many devices were asked for; None is one for each member.
 
     Raises:
       UsageError: there is no run, or it is another one: the message has the settings that differ.
@@ -36,6 +37,7 @@ def named(path: Path, wanted: Mapping[str, Any]) -> Described:
         raise UsageError(f"--resume={path}: {refusal}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
     members = [_with_train(member, steps=steps) for member in run.members]
+    runtime.divide_processor(devices or len(members))  # what follows starts JAX
     try:
         check_train(members[0].config.train)
         check_physics(members[0].config)

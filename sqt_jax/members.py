@@ -83,3 +83,8 @@ def usable_devices(members: int) -> int:
     """
     here = len(jax.local_devices())
     return math.ceil(members / math.ceil(members / here))
+
+
+def layout_here(members: int) -> Layout:
+    """A sweep on the devices that it takes by itself."""
+    return Layout(members, tuple(jax.local_devices()[: usable_devices(members)]))

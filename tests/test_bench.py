@@ -22,11 +22,16 @@ def test_ratios_are_those_of_one_task_and_number_of_members():
     loops = {"td3 on ant, mjx": 200.0, "td3 on ant, mujoco": 250.0, "td3 on walker, mujoco": 300.0}
     loops["td3 on ant, warp"] = 500.0
     rows += [bench.Row("loop", what, 5, "env steps", rate, 0.0) for what, rate in loops.items()]
+    rows += [
+        bench.Row("loop", f"{what}, 5 devices", 5, "env steps", 3 * rate, devices=5) for what, rate in loops.items()
+    ]
     assert bench.ratios(rows) == [
         "ant, 5 members: mujoco / MuJoCo alone = 0.90",
         "ant, 5 members: mjx / mjx, the file's iterations = 2.50",
         "td3 on ant, 5 members: mujoco / mjx = 1.25",
         "td3 on ant, 5 members: warp / mjx = 2.50",
+        "td3 on ant, 5 members, 5 devices: mujoco / mjx = 1.25",
+        "td3 on ant, 5 members, 5 devices: warp / mjx = 2.50",
     ]
 
 
@@ -41,6 +46,7 @@ def run(monkeypatch, tmp_path):
             bench.main(["bench"])
 
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
+    monkeypatch.setattr(bench.runtime, "divide_processor", lambda devices: None)
     cached = jax.config.jax_enable_compilation_cache
     yield main
     jax.config.update("jax_enable_compilation_cache", cached)
@@ -158,7 +164,7 @@ def test_a_suite_by_name_sets_the_flags_that_were_not_given():
         try:
             bench.check_flags()
             assert bench.FLAGS.members == ["5", "64", "512"] and bench.FLAGS.algos == ["td3", "td7"]
-            assert bench.FLAGS.profile and bench.FLAGS.suites == ["loop"] and bench.FLAGS.devices == ["1", "all"]
+            assert bench.FLAGS.profile and bench.FLAGS.suites == ["loop"] and bench.FLAGS.devices == ["1", "auto"]
             assert bench.FLAGS.tasks == bench.PAPERS_TASKS  # as given
         finally:
             bench.FLAGS["tasks"].present = 0
@@ -183,12 +189,13 @@ def test_a_peer_that_is_not_installed_is_told_before_anything_runs(monkeypatch):
 
 def test_more_devices_than_there_are_are_refused(monkeypatch):
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
+    monkeypatch.setattr(bench.runtime, "divide_processor", lambda devices: None)
     cached = jax.config.jax_enable_compilation_cache
     bench.FLAGS.mark_as_parsed()
     try:
         with (
             flagsaver.flagsaver(devices=["1", "99"]),
-            pytest.raises(SystemExit, match="^--devices: takes at most . here"),
+            pytest.raises(SystemExit, match=r"^--devices: takes at most \d+ here"),
         ):
             bench.main(["bench"])
     finally:
@@ -213,13 +220,10 @@ def test_what_would_give_no_rows_or_lose_them_is_refused(given, told):
         bench.main(["bench"])
 
 
-def test_all_devices_are_as_many_as_there_are(monkeypatch):
+def test_automatic_devices_are_left_to_the_number_of_members():
     bench.FLAGS.mark_as_parsed()
-    with flagsaver.flagsaver(devices=["1", "all"]):
-        monkeypatch.setattr(jax, "local_devices", lambda: [None] * 4)
-        assert bench.devices_here() == [1, 4]
-        monkeypatch.setattr(jax, "local_devices", lambda: [None])
-        assert bench.devices_here() == [1]
+    with flagsaver.flagsaver(devices=["1", "auto"]):
+        assert bench.devices_here() == [1, None]
 
 
 @pytest.mark.slow

@@ -127,7 +127,7 @@ def compared(peer, monkeypatch, members, run=lambda steps: None):
         return peer(processes)
 
     monkeypatch.setattr(compare, "usable_cores", lambda: 2)
-    monkeypatch.setattr(compare, "updates", lambda algo, task, members: Made(run, operations=7.0))
+    monkeypatch.setattr(compare, "updates", lambda algo, task, members, devices: Made(run, operations=7.0))
     monkeypatch.setattr(measure, "tried_in_turns", lambda runs, **timing: [timed(run) for run in runs])
     monkeypatch.setattr(compare, "Peer", start)
     timing = {"seconds": 0.0, "repeats": 1}

@@ -22,6 +22,7 @@ def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
             yield case.row
 
     monkeypatch.setattr(growth, "in_turns", in_turns)
+    monkeypatch.setattr(growth, "usable_devices", lambda count: 2 * count)
     monkeypatch.setattr(growth, "updates", lambda *case, **settings: made.append((*case, settings)))
     monkeypatch.setattr(measure, "replay_steps", lambda *case: made.append(case))
     rows = list(growth.rows(["td3"], "ant", 5, seconds=0.0, repeats=1))
@@ -30,10 +31,15 @@ def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
         [("critics", "td3", count) for count in growth.CRITICS],
         *([("capacity", kind, capacity) for capacity in growth.CAPACITIES] for kind in ("uniform", "lap")),
     ]
-    assert ("td3", "ant", 50, {}) in made and ("td3", "ant", 5, {"ensemble_size": 10}) in made
+    assert ("td3", "ant", 50, 100, {}) in made and ("td3", "ant", 5, 10, {"ensemble_size": 10}) in made
     assert ("lap", "sample", "ant", 1_000_000, 5) in made
     assert [found.point for found in rows] == sum(lines, []) and {found.suite for found in rows} == {"growth"}
-    assert rows[5].what == "td3, ant sizes" and rows[5].members == 50 and rows[8].what == "td3, ant sizes, 10 critics"
+    assert (
+        rows[5].what == "td3, ant sizes"
+        and rows[5].members == 50
+        and rows[5].devices == 100
+        and rows[8].what == "td3, ant sizes, 10 critics"
+    )
 
 
 def test_a_figure_shows_the_time_of_one_at_every_point(tmp_path, monkeypatch):

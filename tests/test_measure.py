@@ -73,6 +73,12 @@ def test_fewer_members_than_devices_give_no_row_and_a_line(capsys):
     ]
 
 
+def test_automatic_devices_are_those_of_a_run(monkeypatch):
+    monkeypatch.setattr(measure, "usable_devices", lambda members: 5)
+    assert measure.fitting([1, None], 5) == [1, 5]
+    assert measure.fitting([5, None, 7], 5) == [5]
+
+
 @pytest.mark.parametrize("kind", measure.REPLAYS)
 @pytest.mark.parametrize("what", ["insert", "sample"])
 def test_a_replays_row_names_what_was_measured(kind, what):

@@ -1,8 +1,10 @@
 """MuJoCo C inside compiled programs; that whole episodes are Gymnasium's is in test_gymnasium_parity."""
 
 import concurrent.futures
+import itertools
 import os
 import signal
+import threading
 import time
 
 import jax
@@ -157,9 +159,10 @@ def test_a_warning_handler_of_ones_own_stays(ant):
     assert "heard" in heard
 
 
-def test_programs_in_several_threads_do_not_disturb_each_other(ant):
+@pytest.mark.parametrize("count", [1, 6])  # one is stepped by the caller, six by the pool
+def test_programs_in_several_threads_do_not_disturb_each_other(ant, count):
     physics, model, advance = ant
-    state, control = robots(physics, model, 6)
+    state, control = robots(physics, model, count)
     expected = advance(state, control)
     mujoco_c._pools.clear()  # all of them ask for a pool at once
     fresh = mujoco_c.make(setup_of("ant"), num_threads=2)
@@ -167,7 +170,13 @@ def test_programs_in_several_threads_do_not_disturb_each_other(ant):
     with concurrent.futures.ThreadPoolExecutor(8) as pool:
         results = list(pool.map(lambda _: jax.block_until_ready(step(state, control)), range(40)))
     assert all(same(result, expected) for result in results)
-    assert len(mujoco_c._pools) == 1
+    assert len(mujoco_c._pools) == (count > 1)
+
+
+def numbered(work):
+    """`work(number)` as what a pool runs; the caller's own number is 0."""
+    helpers = itertools.count(1)
+    return lambda: work(0 if threading.current_thread() is threading.main_thread() else next(helpers))
 
 
 def test_an_interrupt_waits_for_the_threads():
@@ -185,7 +194,7 @@ def test_an_interrupt_waits_for_the_threads():
     signal.setitimer(signal.ITIMER_REAL, 0.1)
     try:
         with pytest.raises(KeyboardInterrupt):
-            mujoco_c._threads(3).run(work, 3)
+            mujoco_c._threads(3).run(numbered(work), 3)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -194,12 +203,12 @@ def test_an_interrupt_waits_for_the_threads():
 
 @pytest.mark.filterwarnings("ignore:.*fork.*")
 def test_a_forked_child_has_threads_of_its_own():
-    mujoco_c._threads(3).run(lambda number: None, 3)
+    mujoco_c._threads(3).run(lambda: None, 3)
     child = os.fork()
     if child == 0:
         signal.alarm(20)  # else a child that waits for its parent's threads would wait forever
         seen = []
-        mujoco_c._threads(3).run(seen.append, 3)
+        mujoco_c._threads(3).run(numbered(seen.append), 3)
         os._exit(0 if sorted(seen) == [0, 1, 2] else 1)
     assert os.waitpid(child, 0)[1] == 0
 
@@ -219,9 +228,9 @@ def test_an_error_in_a_thread_is_raised_once_all_have_ended():
 
     threads = mujoco_c._threads(3)
     with pytest.raises(RuntimeError, match="broken"):
-        threads.run(work, 3)
+        threads.run(numbered(work), 3)
     assert sorted(ended) == [0, 2]
-    threads.run(ended.append, 3)  # and they go on working
+    threads.run(numbered(ended.append), 3)  # and they go on working
     assert sorted(ended) == [0, 0, 1, 2, 2]
 
 

@@ -1,6 +1,6 @@
 """MuJoCo's C library on the host, called from inside the compiled program: what Gymnasium computes, in float64.
 
-A control step of all robots of a program (members, environments) is one call: their states go out and come back as one
+A control step of all robots of a device (members, environments) is one call: their states go out and come back as one
 array of 32-bit words each, and a few threads work them off. The call is pure: a robot's whole state (the solver's warm
 start included) is in what it is given, carried through JAX, which has no float64 here, as the bits of float64 numbers.
 """
@@ -36,7 +36,7 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
     """MuJoCo's C library.
 
     Args:
-      num_threads: threads that step robots; None is one for each core that the process may use.
+      num_threads: threads that step the robots of a call; None is one for each core that the process may use.
 
     Raises:
       ValueError: the model has activation states, or there is no thread.

@@ -1,0 +1,53 @@
+"""What a process sets before JAX starts. In processes of their own: in this one it has started."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import test_plan
+
+from sqt_jax.cores import usable_cores
+
+ROOT = Path(__file__).parents[1]
+PROGRAM = """
+import sys
+from experiments import flags, runtime
+runtime.prepare()
+from experiments.plan import make_plan
+print(len(make_plan(flags.parse(["run", *sys.argv[1:]])).layout.devices))
+import jax
+runtime.divide_processor(99)  # too late: without effect, and no error
+print(len(jax.local_devices()))
+"""
+
+
+def devices_of_a_run(*arguments):
+    """How many its members lie on, and how many there are."""
+    command = [sys.executable, "-c", PROGRAM, *arguments]
+    found = subprocess.run(
+        command, check=True, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, cwd=ROOT
+    )
+    return tuple(map(int, found.stdout.split()))
+
+
+def seeds(count):
+    return f"--seeds={','.join(map(str, range(count)))}"
+
+
+def test_a_processor_is_a_device_for_each_member(tmp_path):
+    members = 2 * usable_cores() + 1
+    run = f"--out={tmp_path}", "--algo=td3", "--env=cheetah", "--replay_capacity=10000", seeds(members)
+    assert devices_of_a_run(*run) == (members, members)
+
+
+def test_a_processor_is_a_device_for_each_member_of_a_run_that_goes_on(tmp_path):
+    members = 2 * usable_cores() + 1
+    path = test_plan.begun(tmp_path, "a", "--replay_capacity=10000", seeds(members))
+    assert devices_of_a_run(f"--resume={path}") == (members, members)
+
+
+def test_there_are_at_most_16_devices_for_a_core(tmp_path):
+    here = 16 * usable_cores()
+    run = f"--out={tmp_path}", "--algo=td3", "--env=cheetah", "--replay_capacity=10000", seeds(here + 2)
+    assert devices_of_a_run(*run) == (here // 2 + 1, here)
