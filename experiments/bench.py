@@ -6,7 +6,9 @@
 Operations are those of the matrix products, and their peak is measured in the same run (`operations`).
 Each figure is the median over `--repeats` timed calls of a compiled loop that runs for about `--seconds`, after a
 first call that compiles. The suites of one process run one after the other; compare figures of one run only, since a
-machine's speed changes with what else it does.
+machine's speed changes with what else it does. But for this: where a processor is made many devices (`--devices=auto`
+of many members), as many threads share the operations of each, of a program on one device too, and slow it down.
+Compare one device with one for each member by commands that follow one another.
 
 What fails is told in a line that begins with `failed`, and the rest is measured; the exit code is 1 then. `--json` is
 written anew with every row.
@@ -140,6 +142,16 @@ def devices_here() -> list[int | None]:
     if most := max((count for count in counts if count and count > here), default=None):
         sys.exit(f"--devices: takes at most {here} here, not {most}")
     return counts
+
+
+def most_devices() -> int:
+    """How many a run of the largest sweep here would make of a processor."""
+    numbers = [int(value) for value in FLAGS.devices if value != "auto"]
+    if "auto" in FLAGS.devices or FLAGS.compare:
+        numbers += map(int, FLAGS.members)
+    if "growth" in FLAGS.suites:
+        numbers += growth.MEMBERS
+    return max(numbers)
 
 
 def rows(
@@ -285,10 +297,7 @@ def main(argv: Sequence[str]) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     environment = dict(os.environ)  # before our own options for XLA are in it
     runtime.prepare()
-    numbers = [int(value) for value in FLAGS.members + FLAGS.devices if value != "auto"]
-    if "growth" in FLAGS.suites:
-        numbers += growth.MEMBERS
-    runtime.divide_processor(max(numbers))  # as a run of so many members does
+    runtime.divide_processor(most_devices())
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
     devices_here()

@@ -226,6 +226,18 @@ def test_automatic_devices_are_left_to_the_number_of_members():
         assert bench.devices_here() == [1, None]
 
 
+def test_a_processor_is_as_many_devices_as_the_largest_sweep_takes():
+    bench.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(members=["1", "7"], devices=["1", "3"]):
+        assert bench.most_devices() == 3
+        with flagsaver.flagsaver(devices=["1", "auto"]):
+            assert bench.most_devices() == 7
+        with flagsaver.flagsaver(compare=["sbx"]):
+            assert bench.most_devices() == 7
+        with flagsaver.flagsaver(suites=["growth"]):
+            assert bench.most_devices() == 50
+
+
 @pytest.mark.slow
 def test_what_a_gpu_is_measured_by_runs_here(tmp_path):
     """The whole program, on one small case."""
