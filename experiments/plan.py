@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import psutil
 
-from experiments import described, flags, records, resume, runtime
+from experiments import described, flag_table, flags, records, resume, runtime
 from experiments.described import Described, Member
 from experiments.presets import preset_settings
 from sqt_jax import envs
@@ -125,7 +125,7 @@ def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Des
 
 def _output(options: flags.Options, run: Described | None, train: TrainConfig) -> dict[str, Any]:
     """The run's own flags: as given, as the resumed run has them, or the defaults."""
-    defaults = {"checkpoint_every": flags.CHECKPOINT_EVERY, "keep_checkpoints": flags.KEEP_CHECKPOINTS}
+    defaults = {"checkpoint_every": flag_table.CHECKPOINT_EVERY, "keep_checkpoints": flag_table.KEEP_CHECKPOINTS}
     output: dict[str, Any] = {"tensorboard": True, "devices": None} | defaults
     if run:
         kept = {name: run.content["output"].get(name) for name in output}
@@ -155,7 +155,7 @@ def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
 def _default_name(options: flags.Options) -> str:
     changed: dict[str, Any] = {} if options.preset == "paper" else {"preset": options.preset}
     changed |= options.settings | options.sweep
-    if options.seeds != flags.DEFAULT_SEEDS:
+    if options.seeds != flag_table.DEFAULT_SEEDS:
         changed["seeds"] = options.seeds
     return described.default_name(changed, datetime.now(UTC))
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from experiments import flags, progress, runtime
+from experiments import flag_table, flags, progress, runtime
 from experiments.loop import BEGINNING, Outcome, Position, train_loop
 from sqt_jax.algorithms import agent_of, make_trainer, replay_of
 from sqt_jax.policy import save_policy
@@ -265,7 +265,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
     try:
         options = flags.parse(argv)
         if options is None:
-            print(flags.help_text())
+            print(flag_table.help_text())
             return DONE
         runtime.prepare()
         from experiments.plan import make_plan
