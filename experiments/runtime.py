@@ -38,8 +38,8 @@ def prepare() -> None:
 def divide_processor(devices: int) -> None:
     """Makes the processor at least so many XLA devices, up to 16 for each core; without effect once JAX has started.
 
-    Devices are threads that need not wait for one another. A sweep with one for each of its members keeps the cores
-    busy, whatever its size, where the operations of a single program leave them idle at the end of each.
+    Devices are threads that need not wait for one another. One for each member shares a sweep evenly, whatever its
+    size. What that gains is in BUILD_NOTES.md, "Throughput": some of the update, next to nothing of a whole loop.
     """
     import jax
 
