@@ -1,7 +1,7 @@
 """Throughput of each part: `python -m experiments.bench --suites=env,update,loop --members=1,5`.
 
 `--suite=gpu` and `--suite=growth` are such command lines by name: what a GPU is measured by, and how cost grows.
-`--compare=sbx` adds another project's whole loop on the same machine, in turns with ours (`experiments.compare`).
+`--compare=sbx` adds another project's whole loop on the same machine, in turns with ours (`benchmarks.compare`).
 
 Operations are those of the matrix products, and their peak is measured in the same run (`operations`).
 Each figure is the median over `--repeats` timed calls of a compiled loop that runs for about `--seconds`, after a
@@ -29,8 +29,9 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compare, files, growth, kernels, operations, runtime
-from experiments.measure import (
+from experiments import files
+from experiments.benchmarks import compare, growth, kernels, operations
+from experiments.benchmarks.measure import (
     REPLAYS,
     Failure,
     Row,
@@ -42,8 +43,9 @@ from experiments.measure import (
     on,
     why,
 )
-from experiments.measure_checkpoints import bench_checkpoint
-from experiments.measure_memory import bench_memory
+from experiments.benchmarks.measure_checkpoints import bench_checkpoint
+from experiments.benchmarks.measure_memory import bench_memory
+from experiments.running import runtime
 from sqt_jax import algorithms, envs
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # what is measured if nothing is said

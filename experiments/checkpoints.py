@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import files, manifests
-from experiments.loop import Position
-from experiments.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
+from experiments import files
+from experiments.running import manifests
+from experiments.running.loop import Position
+from experiments.running.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
 from sqt_jax.members import Layout, member_axes
 from sqt_jax.train import TrainState, state_axes
 from sqt_jax.trees import by_path, from_paths

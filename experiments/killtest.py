@@ -25,7 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags, logging
 
-from experiments import described, run
+from experiments import run
+from experiments.running import described
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.envs.autoreset import make_environment
 from sqt_jax.types import Environment
@@ -138,7 +139,7 @@ def child(job: Job, die_at: int | None, count_into: Path | None) -> None:
 def start(job: Job, die_at: int | None = None, count_into: Path | None = None) -> Any:
     # Forked from a server that has imported everything and computed nothing: a process starts in no time.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["experiments.run", "experiments.plan", "experiments.figures"])
+    context.set_forkserver_preload(["experiments.run", "experiments.running.plan", "experiments.evidence.figures"])
     process = context.Process(target=child, args=(job, die_at, count_into))
     process.start()
     return process

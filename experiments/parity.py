@@ -15,12 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags, logging
 
-from experiments import runtime
 from experiments.bench import check_flags, machine, physics_here, solver_limits
-from experiments.distributions import Episodes, Starts, compare_play, compare_starts, play_table, start_table
-from experiments.gymnasium_reference import Episode, episode, recorded
-from experiments.measure import env_steps
-from experiments.timing import measure_in_turns
+from experiments.benchmarks.measure import env_steps
+from experiments.benchmarks.timing import measure_in_turns
+from experiments.gymnasium_parity.distributions import (
+    Episodes,
+    Starts,
+    compare_play,
+    compare_starts,
+    play_table,
+    start_table,
+)
+from experiments.gymnasium_parity.gymnasium_reference import Episode, episode, recorded
+from experiments.running import runtime
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 from sqt_jax.types import Environment

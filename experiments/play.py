@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from experiments import command_line, files, films, graphics
+from experiments import command_line, files
 from experiments.command_line import Parser, UsageError, between, guarded
+from experiments.playing import films, graphics
 
 # All that brings MuJoCo is imported after the way to render has been chosen, and all that brings JAX after what can be
 # refused without it.
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from rich.console import Console
 
-    from experiments.episodes import Episode
+    from experiments.playing.episodes import Episode
     from sqt_jax.types import Environment, TimeStep
 
 EXAMPLE = "python -m experiments.play RUN --video=film.mp4"
@@ -94,10 +95,10 @@ def command(argv: Sequence[str]) -> None:
     _prepare(path, options)
     from rich.console import Console
 
-    from experiments import runtime
+    from experiments.running import runtime
 
     runtime.prepare()
-    from experiments import episodes, policies
+    from experiments.playing import episodes, policies
 
     run = policies.read(path)
     chosen = policies.choose(run, policies.final_returns(path, len(run.members)), options.seed, options.member)
@@ -117,7 +118,7 @@ def command(argv: Sequence[str]) -> None:
     elif not (graphics.has_display() and graphics.works("glfw")):
         print("no display here: --video=FILE films it")
     else:
-        from experiments import viewer
+        from experiments.playing import viewer
 
         try:
             viewer.show(task.scene, [episode.shown for episode in played], task.period, options.camera)
@@ -153,7 +154,7 @@ def _env_name(path: Path) -> str:
 
 def _task(config: Any, options: argparse.Namespace) -> Task:
     """What the member's run trained on, on the physics that is asked for. Raises `UsageError` where it cannot be."""
-    from experiments import brax_pages, episodes, rendering
+    from experiments.playing import brax_pages, episodes, rendering
     from sqt_jax import envs
     from sqt_jax.envs import brax_envs, gym_tasks
 
@@ -181,7 +182,8 @@ def _task(config: Any, options: argparse.Namespace) -> Task:
 def _play(task: Task, policy: Callable, options: argparse.Namespace, console: "Console") -> "list[Episode]":
     import jax
 
-    from experiments import episodes, progress
+    from experiments.playing import episodes
+    from experiments.running import progress
 
     key = jax.random.key(options.start_seed)
     most = min(options.steps or task.env.episode_length, task.env.episode_length)
@@ -194,7 +196,8 @@ def _play(task: Task, policy: Callable, options: argparse.Namespace, console: "C
 def _film(
     task: Task, played: "Sequence[Episode]", options: argparse.Namespace, caption: str, console: "Console"
 ) -> None:
-    from experiments import brax_pages, progress, rendering
+    from experiments.playing import brax_pages, rendering
+    from experiments.running import progress
 
     path: Path = options.video
     try:

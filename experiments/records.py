@@ -13,9 +13,9 @@ import numpy as np
 
 from experiments import files
 from experiments.csv_table import Shortened, Table
-from experiments.described import Member
-from experiments.events import Events
-from experiments.loop import Outcome, Report
+from experiments.running.described import Member
+from experiments.running.events import Events
+from experiments.running.loop import Outcome, Report
 from experiments.statistics import iqm, score
 from sqt_jax import bias
 

@@ -36,7 +36,8 @@ def parser() -> Parser:
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
     command_line.refuse_file("--out", options.out, options.overwrite)
-    from experiments import collected, described, figures, page, run_details, tabulated  # they take a second or two
+    from experiments.evidence import collected, figures, page, run_details, tabulated
+    from experiments.running import described  # they take a second or two
 
     runs = collected.collect(options.runs)
     content = page.Content(

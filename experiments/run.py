@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from experiments import flag_table, flags, progress, runtime
-from experiments.loop import BEGINNING, Outcome, Position, train_loop
+from experiments.running import flag_table, flags, progress, runtime
+from experiments.running.loop import BEGINNING, Outcome, Position, train_loop
 from sqt_jax.algorithms import agent_of, make_trainer, replay_of
 from sqt_jax.policy import save_policy
 from sqt_jax.train import Sweep, TrainState, evaluation_steps, make_sweep
@@ -30,9 +30,9 @@ from sqt_jax.types import Array, Environment, Scalars
 # imported where they are used, so that a typing error is answered in a second.
 if TYPE_CHECKING:
     from experiments.checkpoints import Checkpoints, Restored
-    from experiments.described import Described
-    from experiments.plan import Plan
     from experiments.records import Records
+    from experiments.running.described import Described
+    from experiments.running.plan import Plan
 
 DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -113,7 +113,7 @@ def _start(plan: "Plan") -> tuple[Array, Scalars]:
 
 def _restored(plan: "Plan", store: "Checkpoints", template: TrainState) -> "Restored | None":
     """Where the resumed run goes on; None is from the start."""
-    from experiments import manifests
+    from experiments.running import manifests
 
     if not plan.resumed:
         return None
@@ -133,8 +133,9 @@ def _summary(plan: "Plan") -> Path:
 
 def _claim(plan: "Plan", command: Sequence[str]) -> None:
     """Makes the folder a run: writes config.json into it, where nothing else is or what is there may be replaced."""
-    from experiments import described, records
-    from experiments.plan import taken
+    from experiments import records
+    from experiments.running import described
+    from experiments.running.plan import taken
 
     try:
         if plan.options.overwrite:
@@ -153,7 +154,7 @@ def _claim(plan: "Plan", command: Sequence[str]) -> None:
 
 def _go_on(plan: "Plan", run: "Described", restored: "Restored | None", command: Sequence[str]) -> None:
     """Says in config.json that the run goes on, and removes what told of its end."""
-    from experiments import described
+    from experiments.running import described
 
     at = restored.position.env_steps if restored else 0
     try:
@@ -186,7 +187,7 @@ def _tables(plan: "Plan", restored: "Restored | None", warn: Callable[[str], Non
 
 def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes: tuple[int, int]) -> None:
     """Says what is about to happen, and what it costs."""
-    from experiments import resume
+    from experiments.running import resume
 
     def say(text: str) -> None:
         console.print(text, soft_wrap=True, highlight=False, markup=False)
@@ -246,7 +247,8 @@ def _train(
 
 def _results(plan: "Plan", outcome: Outcome) -> bool:
     """Writes the policies and, where there are evaluations, the curves; whether there are."""
-    from experiments import figures, records
+    from experiments import records
+    from experiments.evidence import figures
 
     policy, part = plan.path / "policy", plan.path / "policy.part"
     shutil.rmtree(part, ignore_errors=True)
@@ -268,7 +270,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
             print(flag_table.help_text())
             return DONE
         runtime.prepare()
-        from experiments.plan import make_plan
+        from experiments.running.plan import make_plan
 
         return run(make_plan(options, env), argv)
     except flags.UsageError as error:

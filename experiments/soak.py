@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import psutil
 from absl import app, flags, logging
 
-from experiments import runtime
+from experiments.running import runtime
 from sqt_jax import envs, rollout
 from sqt_jax.envs import TASKS
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from absl import app
 from absl import flags as absl_flags
 
-from experiments.progress import format_seconds
+from experiments.running.progress import format_seconds
 from sqt_jax.names import unknown
 
 TASKS = ("cheetah", "walker", "ant", "humanoid")

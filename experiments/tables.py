@@ -34,7 +34,7 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    from experiments import collected, formats, tabulated  # these and what they bring take a second or two
+    from experiments.evidence import collected, formats, tabulated  # these and what they bring take a second or two
 
     runs = collected.collect(options.runs)
     if options.out:

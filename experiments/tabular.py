@@ -26,10 +26,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from experiments import contraction, mdps, runtime, tabular_agents, tabular_figure
-from experiments import tabular_report as report
-from experiments.flags import ABSL_FLAGS, UsageError
-from experiments.progress import format_seconds
+from experiments.running import runtime
+from experiments.running.flags import ABSL_FLAGS, UsageError
+from experiments.running.progress import format_seconds
+from experiments.theorem import contraction, mdps, tabular_agents, tabular_figure
+from experiments.theorem import tabular_report as report
 from sqt_jax.names import nearest, unknown
 
 DONE, BAD_USAGE, INTERRUPTED = 0, 2, 130
@@ -191,7 +192,7 @@ def settings_of(flag: dict[str, Any]) -> list[str]:
         f"MaxMin and SQT: {flag['tables']} tables, ddof {flag['ddof']}, a' greedy by the {flag['greedy']}; weighted "
         f"Double Q: c {flag['weighted_c']:g}; initial values "
         + (f"N(0, {flag['init_std']:g}^2)" if flag["init_std"] else "0"),
-        "T: the expected target of eq. 13 as experiments/tabular_agents.py states it; the paper itself was not at hand",
+        "T: the expected target of eq. 13 as theorem/tabular_agents.py states it; the paper itself was not at hand",
         *(mdps.ABOUT[name] for name in flag["mdps"]),
     ]
 

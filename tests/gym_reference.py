@@ -7,7 +7,7 @@ from functools import cache
 
 import jax
 
-from experiments import gymnasium_reference
+from experiments.gymnasium_parity import gymnasium_reference
 from sqt_jax import envs
 from sqt_jax.types import Environment, TimeStep
 

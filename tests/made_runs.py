@@ -8,8 +8,8 @@ from unittest import mock
 import jax
 import numpy as np
 
-from experiments import described
 from experiments.records import EVALUATION_COLUMNS
+from experiments.running import described
 from sqt_jax.algorithms import agent_of, make_config
 from sqt_jax.policy import save_policy
 

@@ -11,8 +11,8 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench
-from experiments.kernels import Kind
-from experiments.measure import Failure
+from experiments.benchmarks.kernels import Kind
+from experiments.benchmarks.measure import Failure
 from sqt_jax.envs import physics
 
 

@@ -10,8 +10,8 @@ import pytest
 from brax.base import Transform
 from made_runs import add_policies, write_run
 
-from experiments import brax_pages
 from experiments.play import main
+from experiments.playing import brax_pages
 from sqt_jax import envs
 from sqt_jax.envs import brax_envs
 

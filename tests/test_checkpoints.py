@@ -11,10 +11,11 @@ import probe_envs
 import pytest
 from test_train import identical, make, start
 
-from experiments import checkpoints, files, manifests
+from experiments import checkpoints, files
 from experiments.checkpoints import Checkpoints
-from experiments.loop import Position
-from experiments.manifests import Refused
+from experiments.running import manifests
+from experiments.running.loop import Position
+from experiments.running.manifests import Refused
 from sqt_jax import train
 from sqt_jax.algorithms import ALGORITHMS, replay_of
 from sqt_jax.members import Layout

@@ -6,8 +6,8 @@ import sys
 import jax
 import pytest
 
-from experiments import compare, measure
-from experiments.measure import Failure, Made, Row
+from experiments.benchmarks import compare, measure
+from experiments.benchmarks.measure import Failure, Made, Row
 
 PROGRAM = """
 import os, sys

@@ -6,8 +6,8 @@ from itertools import product
 
 import pytest
 
-from experiments import described
-from experiments.described import default_name
+from experiments.running import described
+from experiments.running.described import default_name
 from sqt_jax.algorithms import make_config
 
 OUTPUT = {"tensorboard": True, "checkpoint_every": 20, "keep_checkpoints": 2}

@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from experiments import distributions
+from experiments.gymnasium_parity import distributions
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from probe_envs import constant_reward, countdown
 
-from experiments.episodes import CHUNK, configuration, ending, play
+from experiments.playing.episodes import CHUNK, configuration, ending, play
 from sqt_jax import envs
 from sqt_jax.envs.autoreset import make_environment
 from sqt_jax.evaluate import evaluate_policy

@@ -4,10 +4,10 @@ from figure_reader import legend_of, panels, pixels_of
 from made_runs import write_run
 from matplotlib.image import imread
 
-from experiments import figures
-from experiments.collected import collect
-from experiments.figure_style import ALGORITHM_COLOURS, COLOURS
-from experiments.figures import draw_curves, over_time, penalty_sweep
+from experiments.evidence import figures
+from experiments.evidence.collected import collect
+from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS
+from experiments.evidence.figures import draw_curves, over_time, penalty_sweep
 from experiments.records import EVALUATION_COLUMNS
 
 NAN = float("nan")

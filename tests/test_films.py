@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import films
+from experiments.playing import films
 from sqt_jax.envs.gym_table import TASKS
 from sqt_jax.envs.gym_tasks import load_model
 

@@ -6,7 +6,7 @@ import pytest
 from made_runs import write_run
 
 from experiments.command_line import UsageError
-from experiments.finished_runs import find, read_run
+from experiments.evidence.finished_runs import find, read_run
 
 
 def test_runs_are_found_in_and_below_folders_each_once(tmp_path):

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from experiments import flags
+from experiments.running import flags
 
 
 def parse(*arguments):

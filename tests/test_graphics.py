@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from experiments import graphics
-from experiments.graphics import NoGraphics, choose, has_display
+from experiments.playing import graphics
+from experiments.playing.graphics import NoGraphics, choose, has_display
 
 DISPLAY = {"DISPLAY": ":0"}
 

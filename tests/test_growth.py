@@ -2,8 +2,8 @@
 
 import pytest
 
-from experiments import growth, measure
-from experiments.measure import Row
+from experiments.benchmarks import growth, measure
+from experiments.benchmarks.measure import Row
 from sqt_jax import algorithms
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.gymnasium_reference import gymnasium_environment
+from experiments.gymnasium_parity.gymnasium_reference import gymnasium_environment
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
 from sqt_jax.envs.autoreset import SHORTEST_FALL

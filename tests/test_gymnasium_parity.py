@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gym_reference import MJX_TASKS, environment, ours, recorded
 
-from experiments.gymnasium_reference import episode, gymnasium_environment
+from experiments.gymnasium_parity.gymnasium_reference import episode, gymnasium_environment
 from experiments.parity import EPISODES, compare_episodes
 from sqt_jax import envs
 from sqt_jax.envs import TASKS

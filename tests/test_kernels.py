@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import kernels
-from experiments.kernels import Kind
+from experiments.benchmarks import kernels
+from experiments.benchmarks.kernels import Kind
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +43,11 @@ def test_a_loop_that_is_one_kernel_is_an_operation(kinds):
 
 @pytest.mark.slow
 def test_a_loop_is_one_kernel_where_runs_ask_xla_for_it():
-    """With the option of `experiments.runtime`; by itself XLA does so with less data only."""
+    """With the option of `experiments.running.runtime`; by itself XLA does so with less data only."""
     program = """
 import sys
-from experiments import kernels, runtime
+from experiments.benchmarks import kernels
+from experiments.running import runtime
 if sys.argv[1] == "prepared":
     runtime.prepare()
 import jax, jax.numpy as jnp

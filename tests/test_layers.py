@@ -1,6 +1,7 @@
 """Imports go downwards only, read from the source text."""
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
@@ -28,9 +29,31 @@ LAYERS = [
     {"sqt_jax.algorithms"},
     {"sqt_jax.policy"},
     {"sqt_jax"},
-    {"experiments"},
+    {"experiments", "experiments.files", "experiments.csv_table", "experiments.statistics"},
+    {"experiments.command_line"},
+    {"experiments.running"},
+    {"experiments.evidence"},
+    {
+        "experiments.playing",
+        "experiments.benchmarks",
+        "experiments.gymnasium_parity",
+        "experiments.theorem",
+    },
+    {f"experiments.{command}" for command in ("run", "sweep", "tables", "plots", "play", "tabular", "bench", "soak")},
+    {"experiments.report", "experiments.parity", "experiments.killtest"},  # take parts of other commands
 ]
-PACKAGES = ("sqt_jax.agents", "sqt_jax.envs", "experiments")
+PACKAGES = (
+    "sqt_jax.agents",
+    "sqt_jax.envs",
+    "experiments.running",
+    "experiments.evidence",
+    "experiments.playing",
+    "experiments.benchmarks",
+    "experiments.gymnasium_parity",
+    "experiments.theorem",
+)
+# Parts of a package that people look for one folder higher.
+HIGHER = {f"experiments.{name}": "experiments.running" for name in ("presets", "records", "checkpoints")}
 # Beyond the order of the layers.
 REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
 NETWORKS = ("sqt_jax.networks", "sqt_jax.sale", "sqt_jax.losses", "sqt_jax.q_targets")
@@ -87,7 +110,7 @@ def inside(module: str, package: str) -> bool:
 
 def unit(module: str) -> str:
     """The package of the layers that a module belongs to, or itself."""
-    return next((package for package in PACKAGES if inside(module, package)), module)
+    return next((package for package in PACKAGES if inside(module, package)), HIGHER.get(module, module))
 
 
 def layer(module: str) -> int:
@@ -96,6 +119,7 @@ def layer(module: str) -> int:
     return ranks[0]
 
 
+@functools.cache
 def imported(module: str) -> set[str]:
     path = MODULES[module]
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]

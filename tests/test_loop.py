@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.loop import Position, checkpoint_steps, train_loop
+from experiments.running.loop import Position, checkpoint_steps, train_loop
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation
 from sqt_jax.rollout import Episodes

@@ -6,8 +6,8 @@ import pytest
 from html_reader import Reader
 from matplotlib.figure import Figure
 
-from experiments.figures import image
-from experiments.markup import document, element, inline_svg
+from experiments.evidence.figures import image
+from experiments.evidence.markup import document, element, inline_svg
 
 pytestmark = pytest.mark.filterwarnings("ignore:Glyph 1 ")  # a control character in a figure
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments import mdps
+from experiments.theorem import mdps
 
 
 def two_states():

@@ -5,8 +5,8 @@ import weakref
 import jax
 import pytest
 
-from experiments import kernels, measure
-from experiments.measure import Case, Failure, Made, Row
+from experiments.benchmarks import kernels, measure
+from experiments.benchmarks.measure import Case, Failure, Made, Row
 
 SHORT = {"seconds": 0.0, "repeats": 1}
 

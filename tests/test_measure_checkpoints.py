@@ -1,4 +1,4 @@
-from experiments import measure_checkpoints
+from experiments.benchmarks import measure_checkpoints
 
 
 def test_a_checkpoint_is_timed_as_a_whole_in_part_and_as_training_feels_it(monkeypatch):

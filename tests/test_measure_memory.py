@@ -2,8 +2,8 @@
 
 import pytest
 
-from experiments import measure_memory
-from experiments.measure import MEGABYTES
+from experiments.benchmarks import measure_memory
+from experiments.benchmarks.measure import MEGABYTES
 from sqt_jax.config import ConfigError
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import operations
+from experiments.benchmarks import operations
 from sqt_jax.algorithms import make_agent, make_agent_config
 from sqt_jax.types import Transition
 

@@ -4,10 +4,10 @@ import pytest
 from html_reader import Reader
 from made_runs import write_run
 
-from experiments import figures, run_details, tabulated
-from experiments.collected import collect
-from experiments.page import Content, page, sort_key
-from experiments.table_parts import Cell
+from experiments.evidence import figures, run_details, tabulated
+from experiments.evidence.collected import collect
+from experiments.evidence.page import Content, page, sort_key
+from experiments.evidence.table_parts import Cell
 
 
 def content_of(folder, reference=False):

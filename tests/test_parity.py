@@ -7,7 +7,7 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import parity
-from experiments.gymnasium_reference import episode
+from experiments.gymnasium_parity.gymnasium_reference import episode
 from sqt_jax import envs
 
 

@@ -6,8 +6,8 @@ import jax
 import probe_envs
 import pytest
 
-from experiments import described, flags
-from experiments.plan import make_plan
+from experiments.running import described, flags
+from experiments.running.plan import make_plan
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "

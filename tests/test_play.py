@@ -13,7 +13,8 @@ import pytest
 from made_runs import add_policies, write_run
 
 import sqt_jax
-from experiments import graphics, play, rendering
+from experiments import play
+from experiments.playing import graphics, rendering
 from sqt_jax import envs
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -96,7 +97,7 @@ def test_a_member_is_asked_for_and_steps_are_limited(folder, capsys):
 
 
 def test_where_there_is_a_display_mujocos_viewer_shows_it(folder, capsys, monkeypatch):
-    from experiments import viewer
+    from experiments.playing import viewer
 
     shown = []
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.progress import (
+from experiments.running.progress import (
     PLAIN_SECONDS,
     Display,
     Status,

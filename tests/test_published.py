@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import published
+from experiments.evidence import published
 
 ROOT = Path(__file__).parent.parent
 
@@ -44,7 +44,8 @@ def test_q_stds():
 
 
 def test_all_data_are_installed_with_the_package():
-    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["experiments"]
-    matched = {path for pattern in patterns for path in (ROOT / "experiments").glob(pattern)}
-    assert matched == {path for path in (ROOT / "experiments" / "data").rglob("*") if path.is_file()}
+    folder = ROOT / "experiments" / "evidence"
+    packaged = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    matched = {path for pattern in packaged["experiments.evidence"] for path in folder.glob(pattern)}
+    assert matched == {path for path in (folder / "data").rglob("*") if path.is_file()}
     assert {*published.FOLDER.iterdir()} < matched

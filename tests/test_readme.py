@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from absl.testing import flagsaver
 
-from experiments import bench, flags, play, plots, report, run, tables
-from experiments.plan import make_plan
+from experiments import bench, play, plots, report, run, tables
+from experiments.running import flags
+from experiments.running.plan import make_plan
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

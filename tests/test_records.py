@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from experiments import records
-from experiments.described import make_members
-from experiments.loop import Outcome, Report
 from experiments.records import (
     EVALUATION_COLUMNS,
     Records,
@@ -15,6 +13,8 @@ from experiments.records import (
     read_evaluations,
     summarise,
 )
+from experiments.running.described import make_members
+from experiments.running.loop import Outcome, Report
 from sqt_jax.algorithms import make_config
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from experiments import graphics, rendering
+from experiments.playing import graphics, rendering
 from sqt_jax.envs.gym_table import TASKS
 from sqt_jax.envs.gym_tasks import load_model
 
@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 96, 64
 DRAW = """
 import sys
 import mujoco, numpy as np
-from experiments import rendering
+from experiments.playing import rendering
 drawn = {}
 for path in sys.argv[2:]:
     model = mujoco.MjModel.from_binary_path(path)

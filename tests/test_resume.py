@@ -13,9 +13,10 @@ import pytest
 from test_cli import rows_of, run
 
 import experiments.run
-from experiments import checkpoints, described, loop, records
+from experiments import checkpoints, records
 from experiments.killtest import differences, result_of
 from experiments.run import main
+from experiments.running import described, loop
 
 MEMBERS = ("--penalty_coef=0,0.5", "--checkpoint_every=20")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import probe_envs
 import pytest
 
-from experiments import manifests
 from experiments.run import main
+from experiments.running import manifests
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "

@@ -12,9 +12,9 @@ from sqt_jax.cores import usable_cores
 ROOT = Path(__file__).parents[1]
 PROGRAM = """
 import sys
-from experiments import flags, runtime
+from experiments.running import flags, runtime
 runtime.prepare()
-from experiments.plan import make_plan
+from experiments.running.plan import make_plan
 print(len(make_plan(flags.parse(["run", *sys.argv[1:]])).layout.devices))
 import jax
 runtime.divide_processor(99)  # too late: without effect, and no error

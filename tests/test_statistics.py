@@ -7,9 +7,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import experiments
-from experiments.statistics import bootstrap, exceeds, improvement, iqm, mean, probability_of_improvement, score
+from experiments.statistics import (
+    bootstrap,
+    exceeds,
+    improvement,
+    iqm,
+    mean,
+    probability_of_improvement,
+    score,
+)
 
-REFERENCE = Path(experiments.__file__).parent / "data" / "reference"
+REFERENCE = Path(experiments.__file__).parent / "evidence" / "data" / "reference"
 FINITE = st.floats(-1e4, 1e4, allow_subnormal=False)
 SEEDS = hnp.arrays(float, st.integers(1, 12), elements=FINITE)
 

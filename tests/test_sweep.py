@@ -8,7 +8,8 @@ from pathlib import Path
 import probe_envs
 import pytest
 
-from experiments import loop, run
+from experiments import run
+from experiments.running import loop
 from experiments.sweep import PRESETS, Preset, cells, finished, sweep
 from sqt_jax.algorithms import ALGORITHMS
 

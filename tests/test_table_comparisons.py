@@ -2,8 +2,8 @@ import pytest
 from made_runs import write_run
 from table_reader import cells
 
-from experiments.collected import collect
-from experiments.table_comparisons import versus_base
+from experiments.evidence.collected import collect
+from experiments.evidence.table_comparisons import versus_base
 
 
 def test_improvement_by_hand(tmp_path):

@@ -5,7 +5,7 @@ import sys
 import pytest
 from made_runs import write_run
 
-from experiments.formats import FORMATS
+from experiments.evidence.formats import FORMATS
 from experiments.tables import NAMES, main
 
 

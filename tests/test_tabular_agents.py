@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import contraction, mdps
-from experiments import tabular_agents as ta
+from experiments.theorem import contraction, mdps
+from experiments.theorem import tabular_agents as ta
 
 GAMMA = 0.5
 # Two tables' values of the next state: U prefers action 0, V action 1.

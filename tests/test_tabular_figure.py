@@ -2,7 +2,7 @@ from figure_reader import pixels_of
 from made_curves import curves
 from matplotlib.image import imread
 
-from experiments.tabular_figure import STYLES, draw
+from experiments.theorem.tabular_figure import STYLES, draw
 
 
 def test_an_algorithm_has_its_colour_and_an_mdp_its_column(tmp_path):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from made_curves import curves
 
-from experiments import tabular_agents
-from experiments import tabular_report as report
+from experiments.theorem import tabular_agents
+from experiments.theorem import tabular_report as report
 
 
 def test_a_verdict_needs_all_rows_and_their_intervals():

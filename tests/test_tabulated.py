@@ -1,9 +1,9 @@
 from made_runs import write_run
 from table_reader import cells
 
-from experiments import published, tabulated
-from experiments.collected import collect
-from experiments.tabulated import make_tables, table_1, table_2, table_3, table_4
+from experiments.evidence import published, tabulated
+from experiments.evidence.collected import collect
+from experiments.evidence.tabulated import make_tables, table_1, table_2, table_3, table_4
 
 NAN = float("nan")
 

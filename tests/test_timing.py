@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments import timing
+from experiments.benchmarks import timing
 
 
 def test_a_rate_is_iterations_per_second(monkeypatch):

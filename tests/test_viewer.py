@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from experiments import viewer
+from experiments.playing import viewer
 from sqt_jax.envs.gym_table import TASKS
 from sqt_jax.envs.gym_tasks import load_model
 

@@ -1,0 +1,90 @@
+"""How cost grows with members, critics and the replay's capacity: `python -m experiments.bench --suite=growth`."""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
+
+from experiments.benchmarks.measure import REPLAYS, Case, Failure, Row, in_turns, replay_case, updates
+from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
+from sqt_jax.members import usable_devices
+
+MEMBERS = (1, 2, 5, 10, 25, 50)
+CRITICS = (2, 5, 10)
+CAPACITIES = (10_000, 100_000, 1_000_000)
+# What is varied -> the figure's labels.
+LABELS = {
+    "members": ("members", "ms an update of one member"),
+    "critics": ("critics", "ms an update of one member"),
+    "capacity": ("capacity of the replay", "µs for a member's sample and feedback"),
+}
+UNITS = {"members": 1e3, "critics": 1e3, "capacity": 1e6}
+
+
+def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterator[Row | Failure]:
+    """Updates over members and critics, samples over capacities; `members` where they do not vary.
+
+    Members lie on devices as those of a run do.
+
+    The points of a line are measured in turns: a machine that slows down bends none of them.
+    """
+    for algo in algos:
+        yield from in_turns([_update(algo, task, count, ("members", algo, count)) for count in MEMBERS], **timing)
+        critics = [_update(algo, task, members, ("critics", algo, count), ensemble_size=count) for count in CRITICS]
+        yield from in_turns(critics, **timing)
+    for kind in REPLAYS:
+        yield from in_turns([_sample(kind, task, members, capacity) for capacity in CAPACITIES], **timing)
+
+
+def _update(algo: str, task: str, members: int, point: tuple[str, str, int], **settings: int) -> Case:
+    varied, _, value = point
+    what = f"{algo}, {task} sizes" + (f", {value} critics" if varied == "critics" else "")
+    devices = usable_devices(members)
+    row = Row("growth", what, members, "member updates", devices=devices, point=point)
+    return Case(row, functools.partial(updates, algo, task, members, devices, **settings))
+
+
+def _sample(kind: str, task: str, members: int, capacity: int) -> Case:
+    row, make = replay_case(kind, "sample", task, capacity, members)
+    return Case(dataclasses.replace(row, suite="growth", point=("capacity", kind, capacity)), make)
+
+
+def draw(found: Sequence[Row], folder: Path) -> list[Path]:
+    """A figure for each thing that was varied; their files."""
+    paths = []
+    for varied, (x_label, y_label) in LABELS.items():
+        points: dict[str, dict[int, float]] = {}
+        for row in found:
+            if row.point and row.point[0] == varied:
+                points.setdefault(row.point[1], {})[row.point[2]] = UNITS[varied] / row.rate
+        if points:
+            folder.mkdir(parents=True, exist_ok=True)
+            paths.append(folder / f"growth_{varied}.png")
+            _draw(points, x_label, y_label, paths[-1])
+    return paths
+
+
+def _draw(points: dict[str, dict[int, float]], x_label: str, y_label: str, path: Path) -> None:
+    figure = Figure(figsize=(5, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for index, (name, line) in enumerate(points.items()):
+        colour = ALGORITHM_COLOURS.get(name, COLOURS[index % len(COLOURS)])
+        axes.plot(list(line), list(line.values()), color=colour, marker=MARKERS[index % len(MARKERS)], label=name)
+    values = sorted({x for line in points.values() for x in line})
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(FixedLocator(values))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=150)

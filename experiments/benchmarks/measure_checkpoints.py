@@ -1,0 +1,57 @@
+"""What a checkpoint costs: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
+
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from experiments.benchmarks.measure import Row, member_keys
+from experiments.checkpoints import Checkpoints
+from experiments.running.loop import Position
+from sqt_jax import algorithms, envs, train
+from sqt_jax.members import layout_here
+
+FILLED = 100_000  # rows of the replay
+SINCE = 25_000  # of them those that came since the last checkpoint: the default interval
+
+
+def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterator[Row]:
+    """A first checkpoint with all rows, a later one with those of an interval, and how long training waits for it."""
+    config = algorithms.make_config(algo, task, replay_capacity=FILLED)
+    trainer = algorithms.make_trainer(config)
+    replay = algorithms.replay_of(config, envs.make(task))
+    layout = layout_here(members)
+    sweep = train.make_sweep(trainer, layout)
+    scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
+    state = sweep.init(member_keys(members), scalars)
+    everything, later, waits, size = [], [], [], 0
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            store = Checkpoints(Path(folder), replay, layout, 2, print)
+            save(store, state, FILLED - SINCE)
+            waiting, whole = save(store, state, FILLED)
+            waits.append(waiting)
+            later.append(whole)
+        with tempfile.TemporaryDirectory() as folder:
+            everything.append(save(Checkpoints(Path(folder), replay, layout, 2, print), state, FILLED)[1])
+            size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
+
+    def row(what: str, seconds: list[float]) -> Row:
+        return Row("checkpoint", f"{algo}, {task}, {what}", members, "checkpoints", 1 / statistics.median(seconds))
+
+    yield row(f"all {FILLED:,} rows, {size / 1e6:,.0f} MB", everything)
+    yield row(f"{SINCE:,} new rows", later)
+    yield row(f"{SINCE:,} new rows, until training goes on", waits)
+
+
+def save(store: Checkpoints, state: train.TrainState, at: int) -> tuple[float, float]:
+    """Seconds until training could go on, and until the checkpoint is on disk."""
+    began = time.perf_counter()
+    store.save(state, Position(at, at), {})
+    waiting = time.perf_counter() - began
+    store.wait()
+    return waiting, time.perf_counter() - began

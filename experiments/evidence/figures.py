@@ -1,0 +1,294 @@
+"""Figures of runs. Without pyplot: no global state, no display."""
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experiments import statistics
+from experiments.evidence.collected import Collected, Group, Row, differences, setting_text
+from experiments.evidence.figure_style import (
+    COLOURS,
+    LINES,
+    Stars,
+    Style,
+    dress,
+    finish,
+    handle,
+    make_panels,
+    styles,
+    wrapped,
+)
+
+BAND_RESAMPLES = 1000
+STATISTICS = {"iqm": statistics.iqm, "mean": statistics.mean}
+NAMES = {"iqm": "interquartile mean", "mean": "mean"}
+LABELS = {
+    "return_mean": "return of an evaluation episode",
+    "q_std": "std over critics, Q(s, a)",
+    "value_bias": "Q minus discounted return",
+}
+
+
+def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None:
+    """Writes the return and the critics' disagreement of one run over the environment steps as a PNG.
+
+    A colour per group: the mean over its members, a band of one population std, and a thin line per member.
+
+    Args:
+      table: the columns of evaluations.csv (`records.read_evaluations`).
+    """
+    from experiments.records import groups, of_member, swept_columns  # brings JAX
+
+    figure = Figure(figsize=(11, 4.2), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharex=True)
+    names = swept_columns(table)
+    found = groups(table)
+    for axes, column in ((left, "return_mean"), (right, "q_std")):
+        for index, (values, members) in enumerate(found.items()):
+            colour, line = COLOURS[index % len(COLOURS)], LINES[index // len(COLOURS) % len(LINES)]
+            label = ", ".join(f"{name} {value:g}" for name, value in zip(names, values, strict=True))
+            seeds = f"{len(members)} seeds" if len(members) > 1 else "1 seed"
+            curves = [of_member(table, member, column) for member in members]
+            count = min(map(len, curves))
+            env_steps = of_member(table, members[0], "env_steps")[:count]
+            short = np.stack([curve[:count] for curve in curves])
+            _draw_members(axes, env_steps, short, colour, line, f"{label} ({seeds})")
+        if not np.isfinite(table[column]).any():
+            axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", color="0.4")
+            axes.set_yticks([])
+        axes.set_xlabel("environment steps per member")
+        dress(axes)
+    left.set_ylabel(LABELS["return_mean"])
+    right.set_ylabel(LABELS["q_std"])
+    left.legend(frameon=False, fontsize="small", loc="best")
+    figure.suptitle(f"{title}: mean and std over seeds, thin lines the seeds", fontsize="medium")
+    figure.savefig(path)
+
+
+def every(collected: Collected, statistic: str) -> dict[str, Callable[[], Figure | None]]:
+    """All figures by name, each as what draws it; that gives None where there is nothing to show."""
+    biases = [column for group in collected.groups for column in group.columns("value_bias")]
+    columns = dict.fromkeys(["return_mean", "q_std", *biases])
+    draw: dict[str, Callable[[], Figure | None]] = {
+        {"return_mean": "learning_curves"}.get(column, column): partial(over_time, collected, column, statistic)
+        for column in columns
+    }
+    draw |= {"penalty_sweep": partial(penalty_sweep, collected, statistic)}
+    draw |= {"performance_profile": partial(performance_profile, collected)}
+    return {name: partial(_without_formulas, function) for name, function in draw.items()}
+
+
+def over_time(collected: Collected, column: str, statistic: str) -> Figure | None:
+    """A column of evaluations.csv over the env steps, a panel per task; None where no run has measured it.
+
+    The statistic over seeds at each evaluation that all of them have, and its 95 % bootstrap interval as a band.
+    """
+    rows = [row for row in collected.rows if any(np.isfinite(g.values(column)).any() for g in row.groups.values())]
+    if not rows:
+        return None
+    style = styles(collected.rows)
+    stars = Stars()
+    figure, panels = make_panels(rows, collected.tasks)
+    for panel in panels:
+        for row in (row for row in panel.rows if panel.task in row.groups):
+            group = row.groups[panel.task]
+            _draw_group(panel.axes, group, column, statistic, style[row.label], 0.15 if len(panel.rows) < 5 else 0.06)
+            stars.add(row.label, f"{row.label} on {panel.task}", group.notes)
+        if column.startswith("value_bias"):
+            panel.axes.axhline(0, color="0.4", linewidth=0.8, zorder=1)
+        dress(panel.axes)
+    name = LABELS.get(column, column.replace("_", " "))
+    heading = f"{name[0].upper()}{name[1:]}: {NAMES[statistic]} over seeds, band: its 95 % bootstrap interval"
+    finish(figure, panels, style, stars, heading, "environment steps per member", name)
+    return figure
+
+
+def penalty_sweep(collected: Collected, statistic: str) -> Figure | None:
+    """The score against `penalty_coef`, seeds as dots, a panel per task; None where nothing was swept.
+
+    Drawn are groups that are alike in everything but `penalty_coef`, and the plain algorithm's at 0.
+    """
+    sweeps: dict[str, list[list[Group]]] = {}
+    for task in collected.tasks:
+        remaining = [group for group in collected.groups if group.env == task and group.settings["penalty"] != "none"]
+        while remaining:
+            alike = [g for g in remaining if not differences(remaining[0], g, {"penalty_coef"})]
+            remaining = [group for group in remaining if group not in alike]
+            if len(alike) > 1:
+                sweeps.setdefault(task, []).append(sorted(alike, key=lambda group: group.settings["penalty_coef"]))
+    if not sweeps:
+        return None
+    # One row per algorithm, whatever its coefficients.
+    rows = [Row(algo, algo, {}) for algo in dict.fromkeys(row.algo for row in collected.rows)]
+    style, stars = styles(rows), Stars()
+    columns = min(len(sweeps), 4)
+    count = -(-len(sweeps) // columns)
+    figure = Figure(figsize=(1.6 + 3.9 * columns, 0.9 + 3.2 * count), dpi=150, layout="constrained")
+    grid = figure.subplots(count, columns, squeeze=False)
+    for axes in grid.flat[len(sweeps) :]:
+        axes.set_visible(False)
+    drawn: list[Group] = []
+    for (task, found), axes in zip(sweeps.items(), grid.flat, strict=False):
+        axes.set_title(task, fontsize="medium")
+        lines = []
+        for alike in found:
+            base = collected.base(alike[0]).group
+            plain = base and base.settings["penalty"] == "none" and alike[0].settings["penalty_coef"] > 0
+            lines.append([base, *alike] if base and plain else alike)
+        coefs = sorted({group.settings["penalty_coef"] for line in lines for group in line})
+        for index, line in enumerate(lines):
+            shift = (index - (len(lines) - 1) / 2) * 0.12
+            _draw_sweep(axes, line, coefs, shift, statistic, style, drawn)
+            for group in line:
+                coef = setting_text(group.settings["penalty_coef"])
+                stars.add(group.algo, f"{group.algo} at {coef} on {task}", group.notes)
+        # As far apart as they are many: coefficients are often chosen as powers.
+        axes.set_xticks(range(len(coefs)), [setting_text(coef) for coef in coefs])
+        dress(axes, steps=False)
+    algos = {group.algo for group in drawn}
+    handles = [handle(style[row.label], stars.starred(row.label), "o") for row in rows if row.algo in algos]
+    figure.legend(handles=handles, frameon=False, fontsize="small", loc="outside right center", handlelength=3)
+    heading = f"Score against penalty_coef: {NAMES[statistic]} and its 95 % bootstrap interval, dots: seeds"
+    figure.suptitle(wrapped(figure, heading), fontsize="medium")
+    width = int(figure.get_figwidth() * 13)
+    figure.supxlabel("\n".join(["penalty_coef", *stars.lines(width)]), fontsize="small")
+    figure.supylabel("return at the score's evaluation", fontsize="small")
+    return figure
+
+
+def performance_profile(collected: Collected) -> Figure | None:
+    """The share of seeds above each fraction of the best score, tasks weighing the same; None without scores.
+
+    A task's scores are divided by the highest mean score among the rows. Rows without some task are left out and named.
+    """
+    best: dict[str, float] = {}
+    for task in collected.tasks:
+        scores = [row.groups[task].score for row in collected.rows if task in row.groups]
+        highest = max((score.mean for score in scores if score), default=0.0)
+        if highest > 0:
+            best[task] = highest
+    rows, stars = [], Stars()
+    for row in collected.rows:
+        missing = [task for task in best if task not in row.groups or row.groups[task].scores is None]
+        if missing:
+            stars.texts.append(f"left out: {row.label}, which has no score on {', '.join(missing)}")
+        else:
+            rows.append(row)
+    stars.texts += [f"left out: {task}, where no score is positive" for task in collected.tasks if task not in best]
+    if not rows or not best:
+        return None
+    style = styles(collected.rows)
+    normalised: dict[str, list[np.ndarray]] = {}
+    for row in rows:
+        scores_of = ((row.groups[task].scores, value) for task, value in best.items())
+        normalised[row.label] = [scores / value for scores, value in scores_of if scores is not None]
+    low = min(0.0, min(float(np.min(values)) for own in normalised.values() for values in own))
+    high = max(float(np.max(values)) for own in normalised.values() for values in own)
+    thresholds = np.linspace(low, high * 1.02, 200)
+    figure, panels = make_panels(rows, [""])
+    for panel in panels:
+        axes = panel.axes
+        for row in panel.rows:
+            above = [statistics.exceeds(values, thresholds) for values in normalised[row.label]]
+            look = style[row.label]
+            kind = {"color": look.colour, "linestyle": look.line, "marker": look.marker}
+            axes.plot(thresholds, statistics.mean(*above), linewidth=1.8, markevery=25, markersize=4, **kind)
+            if any(len(values) > 1 for values in normalised[row.label]):
+                band = statistics.bootstrap(statistics.mean, *above, resamples=BAND_RESAMPLES)
+                axes.fill_between(
+                    thresholds, *band, color=look.colour, alpha=0.13 if len(panel.rows) < 5 else 0.05, linewidth=0
+                )
+            for task in best:
+                stars.add(row.label, f"{row.label} on {task}", row.groups[task].notes)
+        dress(axes, steps=False)
+        axes.set_ylim(-0.02, 1.02)
+    heading = f"Performance profile over {', '.join(best)}; band: 95 % stratified bootstrap"
+    below = "τ: score as a fraction of the best algorithm's mean on the task"
+    finish(figure, panels, style, stars, heading, below, "share of seeds above τ")
+    return figure
+
+
+def image(figure: Figure, kind: str) -> bytes:
+    """The figure as `png`, `svg` or `pdf`; a figure drawn anew gives the same PNG and SVG."""
+    stream = io.BytesIO()
+    metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind, {})
+    with matplotlib.rc_context({"svg.hashsalt": "sqt_jax"}):  # else its ids are random
+        figure.savefig(stream, format=kind, metadata=metadata)
+    return stream.getvalue()
+
+
+def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
+    """A dollar in a version's name is a dollar: what a run's files say is not typeset."""
+    with matplotlib.rc_context({"text.parse_math": False}):
+        return draw()
+
+
+def _draw_group(axes: Axes, group: Group, column: str, statistic: str, style: Style, opacity: float) -> None:
+    values = group.values(column)  # [seeds, evaluations]
+    measured = np.isfinite(values).all(axis=0)
+    if not measured.any():
+        return
+    env_steps, values = group.env_steps[measured], values[:, measured].T
+    function = STATISTICS[statistic]
+    middle = function(values)
+    few = len(env_steps) < 30
+    marker = style.marker or ("o" if few else "")
+    every = 1 if few else max(1, len(env_steps) // 8)
+    kind = {"color": style.colour, "linestyle": style.line, "marker": marker, "markevery": every}
+    axes.plot(env_steps, middle, linewidth=1.8, markersize=4, zorder=3, **kind)
+    if len(group.seeds) > 1:
+        band = statistics.bootstrap(function, values, resamples=BAND_RESAMPLES)
+        axes.fill_between(env_steps, *band, color=style.colour, alpha=opacity, linewidth=0, zorder=2)
+
+
+def _draw_sweep(
+    axes: Axes,
+    line: Sequence[Group],
+    coefs: Sequence[float],
+    shift: float,
+    statistic: str,
+    style: Mapping[str, Style],
+    drawn: list[Group],
+) -> None:
+    """A line through the groups; a base that another line has `drawn` already is not drawn again."""
+    function = STATISTICS[statistic]
+    places, middles = [], []
+    for group in line:
+        if group.scores is None:
+            continue
+        place = coefs.index(group.settings["penalty_coef"]) + (shift if group.settings["penalty"] != "none" else 0.0)
+        middle = float(function(group.scores))
+        places.append(place)
+        middles.append(middle)
+        if any(group is other for other in drawn):
+            continue
+        drawn.append(group)
+        colour = style[group.algo].colour
+        dots = np.full(len(group.scores), place + 0.05)
+        axes.scatter(dots, group.scores, s=16, color=colour, alpha=0.45, linewidth=0, zorder=2)
+        if len(group.scores) > 1:
+            axes.plot([place, place], statistics.bootstrap(function, group.scores), color=colour, zorder=3)
+        axes.plot([place], [middle], "o", color=colour, markersize=6, zorder=4)
+    look = style[line[-1].algo]
+    axes.plot(places, middles, color=look.colour, linestyle=look.line, linewidth=1.4, zorder=3)
+
+
+def _draw_members(axes: Axes, env_steps: np.ndarray, values: np.ndarray, colour: str, line: str, label: str) -> None:
+    """`values` [members, evaluations]: their mean, a band of one population std, and thin lines."""
+    mean, std = values.mean(axis=0), values.std(axis=0)
+    # Where there is one point, or NaN around it, a line alone would show nothing.
+    marker = "o" if np.isfinite(mean).sum() < 30 else ""
+    if len(values) > 1:
+        for curve in values:
+            axes.plot(env_steps, curve, color=colour, linestyle=line, linewidth=0.6, alpha=0.45, zorder=2)
+        axes.fill_between(env_steps, mean - std, mean + std, color=colour, alpha=0.15, linewidth=0, zorder=1)
+    axes.plot(env_steps, mean, line, color=colour, linewidth=1.8, marker=marker, markersize=3.5, label=label, zorder=3)

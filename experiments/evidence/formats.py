@@ -1,0 +1,123 @@
+"""`table_parts.Table` as terminal output, markdown, CSV and LaTeX."""
+
+import csv
+import io
+import re
+from collections.abc import Callable
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group
+from rich.padding import Padding
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from experiments.evidence.table_parts import Cell, Table
+
+LATEX = {
+    "\\": r"\textbackslash{}",
+    "±": r"$\pm$",
+    "×": r"$\times$",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+} | {character: f"\\{character}" for character in "&%$#_{}"}
+
+
+def rich_table(table: Table) -> Group:
+    """For a console of rich."""
+    shown = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
+    for name in table.header:
+        shown.add_column(name, overflow="fold")
+    for lines in table.sections:
+        for line in lines:
+            shown.add_row(*(Text(_plain(cell)) for cell in line.cells), style="dim" if line.published else "")
+        shown.add_section()
+    below = [Text(table.caption, style="italic")]
+    below += [Text(f"({index}) {note}") for index, note in enumerate(table.notes, 1)]
+    return Group(shown, *(Padding(text, (0, 2)) for text in below), Text(""))
+
+
+def terminal(table: Table, width: int = 200) -> str:
+    """As plain text, for a file or a pipe."""
+    stream = io.StringIO()
+    Console(file=stream, width=width, color_system=None).print(rich_table(table))
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
+
+
+def markdown(table: Table) -> str:
+    def text(cell: Cell) -> str:
+        lines = "<br>".join(line.replace("|", "\\|") for line in cell.lines)
+        return lines + (f" <sup>{_marks(cell)}</sup>" if cell.marks else "")
+
+    rows = [f"### {table.title}", "", f"| {' | '.join(table.header)} |", "|---" * len(table.header) + "|"]
+    for lines in table.sections:
+        for line in lines:
+            cells = [text(cell) for cell in line.cells]
+            rows.append(f"| {' | '.join(f'*{c}*' if line.published and c else c for c in cells)} |")
+    rows += ["", table.caption, ""]
+    rows += [f"<sup>{index}</sup> {note}  " for index, note in enumerate(table.notes, 1)]
+    return "\n".join(rows).rstrip() + "\n"
+
+
+def comma_separated(table: Table) -> str:
+    """The full numbers: a row per cell, not per row of the table."""
+    columns = dict.fromkeys(name for record in table.records for name in record)
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, list(columns), restval="", lineterminator="\n")
+    writer.writeheader()
+    for record in table.records:
+        writer.writerow({name: "" if value is None or value != value else value for name, value in record.items()})
+    return stream.getvalue()
+
+
+def latex(table: Table) -> str:
+    """A `table` with a `tabular`; needs no package."""
+
+    def text(cell: Cell) -> str:
+        marks = f"\\textsuperscript{{{_marks(cell)}}}" if cell.marks else ""
+        lines = [_escaped(line) for line in cell.lines]
+        lines[-1] += marks
+        together = r" \\ ".join(lines)
+        return together if len(lines) == 1 else f"\\shortstack[l]{{{together}}}"
+
+    rows = [
+        r"\begin{table}",
+        r"\centering",
+        r"\footnotesize",
+        f"\\caption{{{_escaped(table.title)}. {_escaped(table.caption)}}}",
+        f"\\begin{{tabular}}{{{'l' * len(table.header)}}}",
+        r"\hline",
+        " & ".join(map(_escaped, table.header)) + r" \\",
+    ]
+    for lines in table.sections:
+        rows.append(r"\hline")
+        for line in lines:
+            cells = [text(cell) for cell in line.cells]
+            rows.append(" & ".join(f"\\textit{{{c}}}" if line.published and c else c for c in cells) + r" \\")
+    rows += [r"\hline", r"\end{tabular}"]
+    for index, note in enumerate(table.notes, 1):
+        rows += ["", f"\\noindent\\textsuperscript{{{index}}} {_escaped(note)}"]
+    return "\n".join([*rows, r"\end{table}"]) + "\n"
+
+
+FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {
+    "terminal": ("txt", terminal),
+    "markdown": ("md", markdown),
+    "csv": ("csv", comma_separated),
+    "latex": ("tex", latex),
+}
+
+
+def _plain(cell: Cell) -> str:
+    text = "\n".join(cell.lines)
+    return f"{text} ({_marks(cell)})" if cell.marks else text
+
+
+def _marks(cell: Cell) -> str:
+    return ",".join(map(str, cell.marks))
+
+
+def _escaped(text: str) -> str:
+    text = "".join(LATEX.get(character, character) for character in text)
+    return re.sub(r"(?<![\w-])-(?=\d)", "$-$", text)

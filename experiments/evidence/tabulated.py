@@ -1,0 +1,305 @@
+"""The paper's tables 1 to 4 of collected runs, as values; `experiments.evidence.formats` writes them.
+
+A cell that is not all it should be carries the numbers of the footnotes that say why. No cell is filled from anywhere
+else than the runs it stands for.
+"""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments import statistics
+from experiments.evidence import published
+from experiments.evidence.collected import (
+    PROTOCOL,
+    Collected,
+    Group,
+    Row,
+    base_algorithm,
+    row_differences,
+    setting_text,
+)
+from experiments.evidence.published import Published
+from experiments.evidence.table_comparisons import forms_compared, has_penalty, versus_base
+from experiments.evidence.table_parts import NOTHING, Cell, Line, Notes, Table, finite, interval, joined, number
+
+NAMES = ("table1", "table2", "table2_improvement", "table3", "table3_change", "table4", "seeds")
+PAPERS_TASKS = ("cheetah", "walker", "ant", "humanoid")
+
+
+def spread(values: np.ndarray) -> dict[str, float | None]:
+    """Mean, population std and IQM of the seeds' values, and 95 % bootstrap intervals; one seed has no interval."""
+    found: dict[str, float | None] = {"mean": float(values.mean()), "std": float(values.std())}
+    found["iqm"] = float(statistics.iqm(values))
+    for name, statistic in (("mean", statistics.mean), ("iqm", statistics.iqm)):
+        low, high = statistics.bootstrap(statistic, values) if len(values) > 1 else (None, None)
+        found |= {f"{name}_low": finite(low), f"{name}_high": finite(high)}
+    return found
+
+
+def make_tables(collected: Collected, reference: bool = False, sizes: Sequence[dict[str, Any]] = ()) -> list[Table]:
+    """All tables that there is something for. `sizes`: what `task_sizes` gives."""
+    tables = [table_1(sizes, reference), table_2(collected, reference)]
+    tables += [versus_base(collected, reference, "table2_improvement"), table_3(collected, reference)]
+    tables += [versus_base(collected, reference, "table3_change"), table_4(collected, reference)]
+    tables += [seeds_table(collected)]
+    return [table for table in tables if any(table.sections)]
+
+
+def task_sizes(collected: Collected) -> list[dict[str, Any]]:
+    """The sizes of the paper's tasks and the runs', from the environments themselves."""
+    return [dict(_sizes(name)) for name in dict.fromkeys([*PAPERS_TASKS, *collected.tasks])]
+
+
+@functools.cache
+def _sizes(name: str) -> Mapping[str, Any]:
+    from sqt_jax import envs  # brings JAX
+
+    env = envs.make(name, "mujoco" if "mujoco" in envs.simulators(name) else None)
+    task = envs.TASKS[name].gymnasium_id if name in envs.TASKS else f"Brax {name.partition(':')[2]}"
+    sizes = {"observation": env.observation_size, "action": env.action_size, "episode_steps": env.episode_length}
+    return {"env": name, "task": task} | sizes
+
+
+def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> Table:
+    header = ["--env", "task", "observation", "action", "steps of an episode"]
+    theirs = published.paper()["table1_obs_action"] if reference else {}
+    lines, records = [], []
+    for row in sizes:
+        cells = [row["env"], row["task"], *(f"{row[name]:,}" for name in ("observation", "action", "episode_steps"))]
+        record = dict(row)
+        if reference:
+            of_paper = theirs.get(row["env"], ("", ""))
+            cells.append(" / ".join(map(str, of_paper)) if row["env"] in theirs else NOTHING)
+            record |= {"paper_observation": of_paper[0], "paper_action": of_paper[1]}
+        lines.append(Line([Cell((cell,)) for cell in cells]))
+        records.append(record)
+    header += [f"{published.PAPER}: observation / action"] if reference else []
+    return Table("table1", "Table 1: sizes of the tasks", header, [lines], "Read from the environments.", [], records)
+
+
+def table_2(collected: Collected, reference: bool) -> Table:
+    caption = (
+        "Score: the best evaluation of the mean over seeds, ± the population std over seeds there (number of seeds). "
+        "Below: the IQM of the seeds at that evaluation and its 95 % bootstrap interval; that this evaluation was "
+        "chosen is not resampled."
+    )
+    figures = published.scores() if reference else []
+    table = ("table2", "Table 2: maximum average return", caption)
+    return _algorithms(table, collected, collected.rows, _score_cell, "score", figures)
+
+
+def table_3(collected: Collected, reference: bool) -> Table:
+    caption = (
+        "std_T: q_std, the mean over the intervals between evaluations in which all seeds had updates, each interval "
+        "the same weight; ± the population std over seeds (number of seeds). Below: its IQM and 95 % bootstrap "
+        "interval. Bias: value_bias over the same evaluations, where it was measured."
+    )
+    figures = published.q_stds() if reference else []
+    table = ("table3", "Table 3: disagreement of the critics (std_T)", caption)
+    return _algorithms(table, collected, collected.rows, _q_std_cell, "q_std", figures)
+
+
+def table_4(collected: Collected, reference: bool) -> Table:
+    """SQT and SQT-tuple, their scores and how they compare."""
+    both = [row for row in collected.rows if has_penalty(row)]
+    families = {base_algorithm(row.algo) for row in both if row.algo.endswith("_tuple")}
+    rows = [row for row in both if base_algorithm(row.algo) in families]
+    caption = (
+        "Scores as in table 2. Comparisons: by how many per cent the first one's score exceeds the second one's, and "
+        "P, the probability that a seed of the first one exceeds one of the second, with 95 % bootstrap intervals."
+    )
+    figures = published.scores() if reference else []
+    keep = {row.algo for row in rows}
+    figures = [figure for figure in figures if figure.algo in keep]  # not of their bases
+    title = "Table 4: the batch's mean std (sqt) and each transition's (sqt_tuple)"
+    table = _algorithms(("table4", title, caption), collected, rows, _score_cell, "score", figures)
+    notes = Notes(table.notes)
+    lines, records = forms_compared(rows, collected, notes)
+    table.records.extend(records)
+    return table._replace(sections=[*table.sections, lines] if lines else table.sections, notes=notes.texts)
+
+
+def seeds_table(collected: Collected) -> Table:
+    """What each seed reached."""
+    notes = Notes()
+    lines, records = [], []
+    for row in collected.rows:
+        for task, group in row.groups.items():
+            returns = group.values("return_mean")
+            values = {"at the score": group.scores, "at the end": group.finals, "q_std": group.mean_of("q_std")}
+            bias = group.mean_of("value_bias")
+            cells = [
+                "  ".join(f"{seed}: {number(v)}" for seed, v in zip(group.seeds, own, strict=True))
+                if own is not None
+                else NOTHING
+                for own in values.values()
+            ]
+            marks = notes(*group.notes)
+            lines.append(Line([Cell((row.label,), marks), Cell((task,)), *(Cell((cell,)) for cell in cells)]))
+            for index, member in enumerate(group.members):
+                own = returns[index]
+                best = int(np.nanargmax(own)) if np.isfinite(own).any() else None
+                at_score, q_std = values["at the score"], values["q_std"]
+                records.append(
+                    {"algo": row.algo, "row": row.label, "env": task, "seed": member.seed}
+                    | {"return_at_score": at_score[index] if at_score is not None else None}
+                    | {"score_env_steps": group.scored_at, "final_return": own[-1]}
+                    | {"best_return": own[best] if best is not None else None}
+                    | {"best_env_steps": int(group.env_steps[best]) if best is not None else None}
+                    | {"q_std": q_std[index] if q_std is not None else None}
+                    | {"value_bias": bias[index] if bias is not None else None, "run": str(member.run)}
+                )
+    header = ["algorithm", "task", "return at the score's evaluation, by seed", "at the last one", "std_T"]
+    caption = "The values of each seed that the tables above are made of."
+    return Table("seeds", "Seeds", header, [lines], caption, notes.texts, records)
+
+
+def _algorithms(
+    table: tuple[str, str, str],
+    collected: Collected,
+    rows: Sequence[Row],
+    cell_of: Callable[[Group], tuple[tuple[str, ...], dict[str, Any], list[str]]],
+    quantity: str,
+    figures: Sequence[Published],
+) -> Table:
+    """Algorithms × tasks, each algorithm's published figures beneath it."""
+    notes = Notes()
+    most = max((len(group.seeds) for group in collected.groups), default=0)
+    sections, records = [], []
+    shown = dict.fromkeys(row.algo for row in rows)
+    if figures:  # of the bases too, in their place
+        shown = dict.fromkeys(name for algo in shown for name in (base_algorithm(algo), algo))
+    for algo in shown:
+        lines = []
+        for row in (row for row in rows if row.algo == algo):
+            cells = [Cell((row.label,), notes(*_row_notes(row)))]
+            for task in collected.tasks:
+                group = row.groups.get(task)
+                if group is None:
+                    cells.append(Cell((NOTHING,), notes("no such run")))
+                    continue
+                text, numbers, why = cell_of(group)
+                why = [*group.notes, *why]
+                if len(group.seeds) < most:
+                    why.append(f"fewer seeds than other cells, which have {most}")
+                cells.append(Cell(text, notes(*why)))
+                records.append(_record(row, group, quantity, numbers, why))
+            penalised = [g for g in row.groups.values() if g.settings["penalty"] != "none"]
+            coefs = dict.fromkeys(group.settings["penalty_coef"] for group in penalised)
+            cells.append(Cell((" / ".join(map(setting_text, coefs)) or NOTHING,)))
+            for name in ("steps", "updates_per_step"):
+                values = dict.fromkeys(group.settings[name] for group in row.groups.values())
+                cells.append(Cell((" / ".join(map(setting_text, values)),)))
+            lines.append(Line(cells))
+        theirs = [figure for figure in figures if figure.algo == algo and figure.env in collected.tasks]
+        lines += _published_lines(theirs, collected.tasks, notes)
+        records += [_published_record(figure, quantity) for figure in theirs]
+        if lines:
+            sections.append(lines)
+    name, title, caption = table
+    header = ["algorithm", *collected.tasks, "penalty_coef", "steps", "UTD"]
+    texts = [caption, *_protocol_notes(rows), *map(_sentence, collected.notes)]
+    if figures and not any(line.published for lines in sections for line in lines):
+        texts.append("Nothing published is known for these algorithms and tasks.")
+    return Table(name, title, header, sections, " ".join(texts), notes.texts, records)
+
+
+def _score_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str]]:
+    if group.score is None or group.scores is None:
+        return (NOTHING,), {}, ["no evaluation that all its seeds have"]
+    found = spread(group.scores)
+    final = {f"final_{name}": value for name, value in spread(group.finals).items()}
+    numbers = found | {"score_env_steps": group.scored_at, "per_seed": joined(group.scores)} | final
+    return _spread_lines(found, len(group.seeds)), numbers, []
+
+
+def _q_std_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str]]:
+    values, bias = group.mean_of("q_std"), group.mean_of("value_bias")
+    if values is None:
+        return (NOTHING,), {}, ["no interval in which all its seeds measured q_std"]
+    found = spread(values)
+    lines, numbers = _spread_lines(found, len(group.seeds)), found | {"per_seed": joined(values)}
+    if bias is not None:
+        lines = (*lines, f"bias {number(bias.mean(), sign=True)} ± {number(bias.std())}")
+    for column in group.columns("value_bias"):
+        measured = group.mean_of(column)
+        if measured is not None:
+            numbers |= {f"{column}_{name}": value for name, value in spread(measured).items()}
+            numbers |= {f"{column}_per_seed": joined(measured)}
+    return lines, numbers, []
+
+
+def _spread_lines(found: Mapping[str, float | None], seeds: int) -> tuple[str, ...]:
+    first = f"{number(found['mean'])} ± {number(found['std'])} ({seeds})"
+    if found["iqm_low"] is None:
+        return (first,)
+    return first, f"{number(found['iqm'])} {interval(found['iqm_low'], found['iqm_high'])}"
+
+
+def _published_lines(figures: Sequence[Published], tasks: Sequence[str], notes: Notes) -> list[Line]:
+    """A line per source, its figures in the columns of their tasks."""
+    sources: dict[tuple[str, ...], dict[str, Published]] = {}
+    for figure in figures:
+        key = (figure.algo, figure.source, figure.env_version, figure.seeds, figure.updates_per_step)
+        sources.setdefault(key, {})[figure.env] = figure
+    lines = []
+    for (algo, source, version, seeds, utd), by_task in sources.items():
+        cells = [Cell((f"published: {algo}, environment {version}, {seeds} seeds", source))]
+        for task in tasks:
+            if task not in by_task:
+                cells.append(Cell((NOTHING,)))
+                continue
+            figure = by_task[task]
+            text = number(figure.value) + (f" ± {number(figure.std)}" if figure.std is not None else "")
+            cells.append(Cell((text,), notes(*figure.notes)))
+        lines.append(
+            Line([*cells, *(Cell((text,)) for text in (NOTHING, "1,000,000", utd or NOTHING))], published=True)
+        )
+    return lines
+
+
+def _published_record(figure: Published, quantity: str) -> dict[str, Any]:
+    where = {"algo": figure.algo, "row": f"published: {figure.algo}", "env": figure.env, "quantity": quantity}
+    numbers = {"mean": figure.value, "std": figure.std, "seeds": figure.seeds, "steps": 1_000_000}
+    source = {"updates_per_step": figure.updates_per_step, "env_version": figure.env_version, "source": figure.source}
+    return where | numbers | source | {"notes": "; ".join(figure.notes)}
+
+
+def _record(row: Row, group: Group, quantity: str, numbers: Mapping[str, Any], why: Sequence[str]) -> dict[str, Any]:
+    settings = {name: group.settings[name] for name in ("penalty_coef", *PROTOCOL)}
+    where = {"algo": row.algo, "row": row.label, "env": group.env, "quantity": quantity}
+    return where | dict(numbers) | {"seeds": joined(group.seeds)} | settings | {"source": "", "notes": "; ".join(why)}
+
+
+def _row_notes(row: Row) -> list[str]:
+    """What a row's tasks do not have in common; UTD and steps have columns of their own."""
+    found = []
+    for name, values in row_differences(row).items():
+        if name not in ("steps", "updates_per_step", *PROTOCOL):
+            pairs = ", ".join(f"{setting_text(value)} ({task})" for task, value in values.items())
+            found.append(f"{name}: {pairs}")
+    return found
+
+
+def _protocol_notes(rows: Sequence[Row]) -> list[str]:
+    """The protocol that all cells have in common, and who differs where they do not."""
+    groups = [(row, group) for row in rows for group in row.groups.values()]
+    common, differing = [], []
+    for name in PROTOCOL[2:]:
+        values: dict[Any, list[str]] = {}
+        for row, group in groups:
+            values.setdefault(group.settings[name], []).append(f"{row.label} on {group.env}")
+        if len(values) == 1:
+            common.append(f"{name} {setting_text(next(iter(values)))}")
+        elif values:
+            ranked = sorted(values.items(), key=lambda item: -len(item[1]))
+            rest = "; ".join(f"{setting_text(value)} for {', '.join(where)}" for value, where in ranked[1:])
+            differing.append(f"Not everywhere the same: {name} is {setting_text(ranked[0][0])}, but {rest}.")
+    return ([f"Common to all: {', '.join(common)}."] if common else []) + differing
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}".rstrip(".") + "."

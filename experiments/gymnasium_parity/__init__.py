@@ -1,0 +1,1 @@
+"""What `experiments.parity` compares with: Gymnasium's own environments, step by step and in distribution."""

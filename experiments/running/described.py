@@ -1,0 +1,180 @@
+"""config.json of a run: what it was started with, and reading that back to go on with it."""
+
+import json
+import os
+import subprocess
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from experiments import files
+from experiments.running.flags import MAX_MEMBERS
+from sqt_jax.algorithms import eval_physics_of, make_config
+from sqt_jax.config import Config, ConfigError
+from sqt_jax.types import Scalars
+
+NAME = "config.json"
+MAX_BYTES = 10_000_000
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "brax", "gymnasium", "numpy", "sqt_jax")
+
+
+class Member(NamedTuple):
+    """One member of a run: a seed with one setting of the swept scalars."""
+
+    seed: int
+    config: Config
+
+
+class Described(NamedTuple):
+    """A run as its config.json tells of it."""
+
+    members: list[Member]
+    swept: list[str]
+    content: dict[str, Any]
+
+
+class NotDescribed(ValueError):
+    """There is no config.json of a run, and why."""
+
+
+def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member]:
+    """Seeds times configurations; seeds vary fastest."""
+    return [Member(seed, config) for config, seed in product(configs, seeds)]
+
+
+def settings_of(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
+    """All settings of a run by name; those that are swept, and `seeds`, as tuples of their values."""
+    settings = members[0].config.flat() | {"seeds": _values(member.seed for member in members)}
+    return settings | {name: _values(getattr(m.config.agent, name) for m in members) for name in swept}
+
+
+def describe(
+    members: Sequence[Member], swept: Sequence[str], command: Sequence[str], preset: str, output: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What config.json holds: the settings (of the first member), the members, and what they ran on."""
+    device = jax.local_devices()[0]
+    return {
+        "settings": members[0].config.flat(),
+        "preset": preset,
+        "replay_rows": members[0].config.train.capacity,
+        "evaluated_on": eval_physics_of(members[0].config),
+        "swept": list(swept),
+        "members": [
+            {"member": index, "seed": member.seed}
+            | {name: getattr(member.config.agent, name) for name in dict.fromkeys(["penalty_coef", *swept])}
+            for index, member in enumerate(members)
+        ],
+        "output": dict(output),
+        "command": list(command),
+        "started": _now(),
+        "device": {"platform": device.platform, "kind": device.device_kind, "cpus": os.cpu_count()},
+        "commit": _commit(),
+        "versions": versions(),
+        "resumed": [],
+    }
+
+
+def read(path: Path) -> Described:
+    """The run in the folder `path`, by its config.json.
+
+    Raises:
+      NotDescribed: there is no such file, or it does not describe a run.
+    """
+    try:
+        content = files.read_json(path / NAME, MAX_BYTES)
+        settings, swept, entries = dict(content["settings"]), list(content["swept"]), list(content["members"])
+        known = set(swept) <= {*Scalars._fields} and len(set(swept)) == len(swept)
+        if not known or not 0 < len(entries) <= MAX_MEMBERS:
+            raise NotDescribed(f"its {NAME} does not describe a run")
+        configs = {
+            values: make_config(**settings | dict(zip(swept, values, strict=True)))
+            for values in _values(tuple(entry[name] for name in swept) for entry in entries)
+        }
+        members = [Member(_seed(entry["seed"]), configs[tuple(entry[name] for name in swept)]) for entry in entries]
+        kinds = {"output": dict, "versions": dict, "resumed": list, "preset": str, "replay_rows": int}
+        for key, kind in kinds.items():
+            if not isinstance(content[key], kind):
+                raise NotDescribed(f"its {NAME} does not describe a run")
+        train, rows = members[0].config.train, content["replay_rows"]
+        if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
+            raise NotDescribed(f"its {NAME} names a replay that cannot be (replay_rows)")
+    except OSError as error:
+        raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None
+    except ConfigError as error:
+        raise NotDescribed(f"its {NAME} names a setting that cannot be: {str(error)[:300]}") from None
+    except NotDescribed:
+        raise
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise NotDescribed(f"its {NAME} does not describe a run ({type(error).__name__})") from None
+    return Described(members, swept, content)
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    with files.whole_file(path / NAME) as file:
+        file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def resumed(
+    content: dict[str, Any], steps: int, output: Mapping[str, Any], env_steps: int, command: Sequence[str]
+) -> dict[str, Any]:
+    """config.json of a run that is gone on with at `env_steps`, to `steps`."""
+    entry = {"env_steps": env_steps, "at": _now(), "command": list(command)}
+    entry |= {"commit": _commit(), "versions": versions()}
+    settings = content["settings"] | {"steps": steps}
+    return content | {"settings": settings, "output": dict(output), "resumed": [*content["resumed"], entry]}
+
+
+def versions() -> dict[str, str | None]:
+    return {name: _version(name) for name in PACKAGES}
+
+
+def default_name(changed: Mapping[str, Any], now: datetime) -> str:
+    """A run's name from the settings that differ from the defaults, and the time (UTC)."""
+
+    def text(value: Any) -> str:
+        return "+".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+    words = [f"{name}={text(value)}" for name, value in changed.items()]
+    # File names end at 255 bytes; which settings they were is in config.json.
+    label = "_".join(words)[:180].replace("/", "-")
+    return "_".join(filter(None, [label, now.strftime("%Y%m%dT%H%M%SZ")]))
+
+
+def _values(values: Any) -> tuple[Any, ...]:
+    return tuple(dict.fromkeys(values))
+
+
+def _seed(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**32:
+        raise ValueError
+    return value
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit of the checkout this file belongs to, with `+changes` where files differ; None without one."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", Path(__file__).name)  # not some other repository around an installation
+        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
