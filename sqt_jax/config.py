@@ -14,8 +14,11 @@ class ConfigError(ValueError):
     """A setting that cannot be. `setting` is its name (the command line's flag without the dashes)."""
 
     def __init__(self, setting: str, message: str):
-        super().__init__(f"--{setting}: {message}")
-        self.setting = setting
+        super().__init__(setting, message)  # both, so that it can be pickled: a pool of processes passes errors so
+        self.setting, self.message = setting, message
+
+    def __str__(self) -> str:
+        return f"--{self.setting}: {self.message}"
 
 
 @dataclasses.dataclass(frozen=True)

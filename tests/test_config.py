@@ -1,6 +1,7 @@
 """Defaults, limits and their messages, and the way of a configuration through a file."""
 
 import json
+import pickle
 
 import pytest
 
@@ -282,3 +283,8 @@ def test_scalars_are_the_settings_of_their_names():
     arrays = agent.scalars().as_arrays()
     assert all(value.shape == () and value.dtype == "float32" for value in arrays)
     assert [round(float(value), 6) for value in arrays] == list(expected)
+
+
+def test_an_error_reaches_another_process_whole():
+    error = pickle.loads(pickle.dumps(ConfigError("steps", "takes a whole number")))
+    assert (type(error), error.setting, str(error)) == (ConfigError, "steps", "--steps: takes a whole number")
