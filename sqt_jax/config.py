@@ -25,7 +25,7 @@ class ConfigError(ValueError):
 class AgentConfig:
     """What an agent is made of: sizes and choices (static), and the start values of the traced `Scalars`."""
 
-    # The target (DESIGN: paper eqs. 4, 8, 18-20).
+    # The target (paper eqs. 4, 8, 18-20).
     penalty: str = "none"  # none | batch_std (SQT, eq. 20) | transition_std (SQT-tuple, eq. 19)
     penalty_coef: float = 0.0  # the paper's alpha
     ddof: int = 1  # of the std over critics; 1 is torch's default, which the authors' released code uses

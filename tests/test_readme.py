@@ -94,17 +94,9 @@ def test_a_policy_of_a_run_loads_as_shown(tmp_path):
     argv = ["run", "--algo=td3", "--env=cheetah", "--seeds=0", "--steps=60", "--warmup_steps=20", "--batch_size=8"]
     argv += ["--hidden=8", "--eval_every=60", "--eval_episodes=1", f"--out={tmp_path}", "--name=tiny", "--quiet"]
     assert run.main([*argv, "--physics=mujoco"]) == 0
-    import gymnasium
-    import jax.export
-    import jax.numpy as jnp
-    import numpy
-
-    import sqt_jax
-
-    path = tmp_path / "cheetah" / "td3" / "tiny"
-    names = {"run": path, "obs": jnp.zeros((4, 17)), "sqt_jax": sqt_jax, "gymnasium": gymnasium}
-    names |= {"jax": jax, "numpy": numpy}
-    for code in [code for _, continued, code in BLOCKS if continued]:
-        exec(code, names)
+    shown = "\n".join(code for _, continued, code in BLOCKS if continued)
+    assert shown.count("runs/cheetah/td3/NAME") == 1
+    names: dict = {}
+    exec(shown.replace("runs/cheetah/td3/NAME", str(tmp_path / "cheetah" / "td3" / "tiny")), names)
     assert names["action"].shape == (4, 6)
     assert names["lengths"].tolist() == [1000, 1000]
