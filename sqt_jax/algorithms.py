@@ -114,6 +114,9 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
         settings["hidden"] = tuple(settings["hidden"])
     row = ALGORITHMS[algo]
     config = AgentConfig(**row.settings | settings)
+    own_penalty = row.settings.get("penalty", AgentConfig.penalty)
+    if config.penalty != own_penalty:
+        raise ConfigError("penalty", f"takes {own_penalty} for {algo}: the algorithm's name says it")
     check_agent(algo, config)
     if row.assessed and config.networks != "sale":
         raise ConfigError("networks", f"takes sale for {algo}")
@@ -136,7 +139,7 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     Raises:
       ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
     """
-    physics, eval_physics = settings.pop("physics", None), settings.pop("eval_physics", Config.eval_physics)
+    physics, eval_physics = settings.pop("physics", None), settings.pop("eval_physics", "auto")
     training = {name: settings.pop(name) for name in TRAIN_SETTINGS & settings.keys()}
     if algo in ALGORITHMS:
         _refuse_unknown(settings, AGENT_SETTINGS | TRAIN_SETTINGS)
@@ -170,9 +173,13 @@ def check_physics(config: Config) -> None:
 
 
 def make_agent(algo: str, observation_size: int, action_size: int, **settings: Any) -> Agent:
-    """An algorithm's `init`, `act` and `update` alone, for a loop and an environment of your own.
+    """An algorithm's functions alone, for a loop and an environment of your own.
+
+    `init`, `act` and `update` are all that td3 and sac need. td7 needs `observe` after each step of its one environment
+    too, or it acts for ever as at the start, and `sqt_jax.lap` as its replay.
 
     Args:
+      observation_size, action_size: O and A; actions are in [-1, 1].
       **settings: fields of `AgentConfig` by name.
 
     Raises:
@@ -218,6 +225,7 @@ def make_train(config: Config, env: Environment | None = None) -> Callable[..., 
     """A whole run of one member: `train(key, scalars=None) -> (state, history)`.
 
     `jax.jit(jax.vmap(train))(keys)` is a sweep over seeds; `scalars` of [S] arrays beside the keys sweep those too.
+    Their values are traced and so not checked: `make_config` with each of them is the check (`Scalars`).
     """
     return train.make_train(make_trainer(config, env), config.train)
 

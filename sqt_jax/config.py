@@ -95,14 +95,14 @@ class TrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One member's whole experiment, but for its seed."""
+    """One member's whole experiment, but for its seed. Made and checked by `sqt_jax.make_config`."""
 
     algo: str
     env: str
-    physics: str = "mjx"  # `make_config`'s default is the first that can compute the environment
-    eval_physics: str = "auto"  # auto: MuJoCo C where the program runs on a CPU, else the training's
-    agent: AgentConfig = AgentConfig()
-    train: TrainConfig = TrainConfig()
+    physics: str
+    eval_physics: str  # auto: MuJoCo C where the program runs on a CPU, else the training's
+    agent: AgentConfig
+    train: TrainConfig
 
     def flat(self) -> dict[str, Any]:
         """All settings by name, without nesting: what `config.json` holds and `make_config` takes back."""

@@ -63,12 +63,15 @@ def _play(
 ) -> tuple[Evaluation, Seen]:
     """Episodes side by side; `seen` is what `watch` makes of each of their steps."""
 
+    # `reset` makes the episodes' keys of `key` by their small numbers: the policy's have to be others.
+    policy_key = jax.random.fold_in(key, 2**31)
+
     def episode_runs(carry):
         return jnp.any(carry[2])
 
     def body(carry):
         number, timestep, running, evaluation, seen = carry
-        action, bonus = policy(timestep.obs, jax.random.fold_in(key, number))
+        action, bonus = policy(timestep.obs, jax.random.fold_in(policy_key, number))
         timestep, transition = rollout.step(env, timestep, lambda obs: action)
         seen = watch(seen, _Step(number, running, transition, bonus))
         evaluation = Evaluation(
@@ -90,9 +93,10 @@ def evaluate_policy(
     """Plays a policy, such as `load_policy` gives, in any environment with its sizes.
 
     Args:
-      policy: obs [B, O] -> action [B, A] in [-1, 1].
+      policy: obs [B, O] -> action [B, A] in [-1, 1]; with an `Environment` it is traced, and has to be JAX code.
       env: an `Environment` on any physics, or one of Gymnasium's, whose action space is a bounded box and whose
         episodes end (made by `gymnasium.make`, they have a time limit).
+      seed: of all the starts; Gymnasium's episode k takes `seed + k`.
 
     Returns:
       Undiscounted returns [episodes] and lengths [episodes].
@@ -103,7 +107,7 @@ def evaluate_policy(
     if isinstance(env, Environment):
         result = jax.jit(lambda key: evaluate(env, policy, key, num_episodes))(jax.random.key(seed))
         return np.asarray(result.returns), np.asarray(result.lengths)
-    low, high = env.action_space.low, env.action_space.high
+    low, high = (getattr(env.action_space, side, np.inf) for side in ("low", "high"))
     if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
         raise ValueError(f"an action space with bounds is needed, not {env.action_space}")
     returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, int)

@@ -32,8 +32,12 @@ def _shapes(capacity: int) -> list[tuple[int, int]]:
 
 
 def priority(td_error: Array, exponent: float, min_priority: float) -> Array:
-    """LAP's priority of rows whose largest |TD error| over the critics is `td_error` [B]: [B]"""
-    return jnp.maximum(td_error, min_priority) ** exponent
+    """LAP's priority of rows whose largest |TD error| over the critics is `td_error` [B]: [B]
+
+    What is not finite counts as no error: it would spoil every sum above it.
+    """
+    size = jnp.where(jnp.isfinite(td_error), jnp.abs(td_error), 0.0)
+    return jnp.maximum(size, min_priority) ** exponent
 
 
 def set_priorities(levels: tuple[Array, ...], index: Array, value: Array) -> tuple[Array, ...]:
@@ -77,6 +81,11 @@ def lap(
 
     New rows get the largest priority seen; every `refresh_every` updates that becomes the largest in the buffer.
     Transitions that have lost their final observation (`Ring`) are drawn no more, older ones are.
+
+    Args:
+      ring: the sizes of the store.
+      batch_size: B.
+      refresh_every: in the `gradient_steps` that `feedback` is given (TD7's: with each copy of its targets).
     """
 
     def init() -> LapState:

@@ -73,6 +73,7 @@ class Gaussian(NamedTuple):
     log_std: Array  # [B, A]
 
     def mode(self) -> Array:
+        """The action [B, A] of the mean: what acts where nothing is to be random."""
         return jnp.tanh(self.mean)
 
     def sample(self, eps: Array, squashed_log_prob: bool = True) -> tuple[Array, Array]:
@@ -91,6 +92,7 @@ class Gaussian(NamedTuple):
 
 
 def clip_log_std(log_std: Array) -> Array:
+    """Any shape; the limits are SAC's."""
     return jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
 
 
@@ -120,6 +122,7 @@ class Critic(nn.Module):
 
 
 def network(module: nn.Module) -> Network:
+    """A module's pure functions."""
     return Network(module.init, module.apply)
 
 

@@ -14,6 +14,7 @@ _adam = optax.scale_by_adam()
 
 
 def adam_init(params: Params) -> optax.OptState:
+    """Adam's moments at the start, shaped as the parameters."""
     return _adam.init(params)
 
 

@@ -30,19 +30,28 @@ MAX_SIZE = 1_000_000  # of an observation or an action
 def save_policy(
     directory: Path | str, config: Config, env: Environment, agent_state: State, members: int | None = None
 ) -> None:
-    """Writes the policies of the first `members` (None: all) of `agent_state` ([S, ...]) to a new directory.
+    """Writes the policies of the first `members` (None: all) of `agent_state` to a new directory.
+
+    Args:
+      agent_state: of a sweep, with a leading axis of members, [S, ...]; that of one agent, by
+        `jax.tree.map(lambda x: x[None], state)`.
 
     Raises:
       FileExistsError: the directory exists.
+      ValueError: the state has no axis of members, or is another agent's.
     """
     directory = Path(directory)
+    agent = agent_of(config, env)
+    arrays = by_path(jax.device_get(agent.policy(agent_state)))
+    expected = {name: leaf.shape for name, leaf in by_path(_shapes(agent)).items()}
+    if {name: array.shape[1:] for name, array in arrays.items()} != expected:
+        raise ValueError(f"agent_state has to be {config.algo}'s with a leading axis of members, [S, ...]")
     directory.mkdir(parents=True)
     sizes = {"observation_size": env.observation_size, "action_size": env.action_size}
     (directory / "config.json").write_text(json.dumps(config.flat() | sizes, indent=1) + "\n")
-    agent = agent_of(config, env)
-    arrays = by_path(jax.device_get(agent.policy(agent_state)))
     (directory / "act.stablehlo").write_bytes(_exported(agent, env.observation_size))
-    for member in range(members or next(iter(arrays.values())).shape[0]):
+    held = next(iter(arrays.values())).shape[0]
+    for member in range(held if members is None else members):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
 
 
@@ -56,7 +65,7 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
     directory = Path(directory)
     config, sizes = _read_config(directory / "config.json")
     agent = ALGORITHMS[config.algo].make_agent(config.agent, *sizes)
-    expected = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
+    expected = _shapes(agent)
     arrays = _read_arrays(directory / f"member_{member}.npz", by_path(expected))
     if arrays is None:
         raise ValueError(f"{directory}: member {member} does not hold a policy of {config.algo} for sizes {sizes}")
@@ -123,9 +132,14 @@ def _one_line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
+def _shapes(agent: Agent) -> Any:
+    """What acting needs of one member, as shapes and types."""
+    return jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
+
+
 def _exported(agent: Agent, observation_size: int) -> bytes:
     """The policy as a function of its arrays by path and of the observations, serialised."""
-    policy = jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
+    policy = _shapes(agent)
 
     def act(arrays: dict[str, Array], obs: Array) -> Array:
         params = from_paths(policy, arrays)

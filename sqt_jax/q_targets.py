@@ -39,7 +39,13 @@ def min_over_subset(next_q: Array, subset: Array) -> Array:
 
 
 def random_subset(key: Array, ensemble_size: int, subset_size: int) -> Array:
-    """Indices [M] of `subset_size` different critics out of `ensemble_size`, each subset equally likely."""
+    """Indices [M] of `subset_size` different critics out of `ensemble_size`, each subset equally likely.
+
+    Raises:
+      ValueError: there are fewer critics than that.
+    """
+    if not 1 <= subset_size <= ensemble_size:
+        raise ValueError(f"a subset takes 1 to {ensemble_size} of the critics, not {subset_size}")
     return jax.random.permutation(key, ensemble_size)[:subset_size]
 
 
@@ -108,7 +114,15 @@ def td_target(
 
     Returns:
       [B].
+
+    Raises:
+      ValueError: other shapes, which would broadcast to a target of something else. Under `jax.vmap`, map over members,
+        never over transitions: SQT's penalty needs the batch.
     """
+    shape = next_q.shape[1:]
+    if next_q.ndim != 2 or not jnp.shape(reward) == jnp.shape(discount) == shape:
+        given = f"{next_q.shape}, {jnp.shape(reward)} and {jnp.shape(discount)}"
+        raise ValueError(f"next_q, reward and discount have to be [N, B], [B] and [B], not {given}")
     value = reduce(next_q)
     if value_bounds is not None:
         value = jnp.clip(value, *value_bounds)
@@ -117,4 +131,6 @@ def td_target(
         target = reward + gamma * discount * (value - penalty(next_q))
     else:
         target = reward + gamma * discount * value - penalty(next_q)
+    if target.shape != shape:
+        raise ValueError(f"reduce, penalty and entropy_term have to leave {shape} of the values, not {target.shape}")
     return jax.lax.stop_gradient(target)

@@ -41,7 +41,7 @@ class Ring(NamedTuple):
       num_envs: E, transitions that are inserted at once, one per environment.
       shortest_episode: steps that episodes take at least, in the mean over a full ring. Room for final observations is
         made for these; where episodes are shorter, the oldest transitions are given up before their rows are. With 1
-        none ever is, and nothing is saved.
+        none ever is (up to a capacity of `MAX_FINALS`), and nothing is saved.
     """
 
     capacity: int
@@ -81,10 +81,13 @@ class Ring(NamedTuple):
         """Takes E transitions, [E, ...]; gives also the numbers of those that lost their final observation, [E] or -1.
 
         Raises:
-          ValueError: other than E transitions.
+          ValueError: other than E transitions of these sizes.
         """
-        if transition.reward.shape[0] != self.num_envs:
-            raise ValueError(f"takes {self.num_envs} transitions at once, not {transition.reward.shape[0]}")
+        e, obs = self.num_envs, (self.num_envs, self.observation_size)
+        sizes = Transition(obs=obs, action=(e, self.action_size), reward=(e,), next_obs=obs, discount=(e,))
+        given = Transition(*map(jnp.shape, transition))
+        if given != sizes:
+            raise ValueError(f"takes transitions of {sizes}, not {given}")
         before = state.inserted - self.num_envs + jnp.arange(self.num_envs)  # the numbers of the rows before
         final = (before >= 0) & jnp.any(state.newest != transition.obs, axis=-1)
         order = jnp.cumsum(final, dtype=jnp.int32) - 1

@@ -38,6 +38,7 @@ class Episodes(NamedTuple):
         return episodes, total
 
     def forget_ended(self) -> "Episodes":
+        """The sums begin anew, the running episodes go on."""
         # An array each: a buffer can be donated once only.
         return self._replace(
             ended_return=jnp.zeros_like(self.ended_return),

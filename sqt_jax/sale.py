@@ -91,6 +91,7 @@ class EncoderNetwork(NamedTuple):
 
 
 def encoder(embedding_size: int, hidden: Sequence[int]) -> EncoderNetwork:
+    """SALE's two encoders: zs of obs [B, O], zsa of zs [B, Z] and action [B, A], both [B, Z]."""
     module = Encoder(embedding_size, hidden)
     return EncoderNetwork(
         module.init, functools.partial(module.apply, method="zs"), functools.partial(module.apply, method="zsa")
@@ -103,5 +104,5 @@ def sale_actor(action_size: int, hidden: Sequence[int], gaussian: bool = False) 
 
 
 def sale_critics(ensemble_size: int, hidden: Sequence[int]) -> Network:
-    """N independent critics as one: -> [N, B]"""
+    """N independent critics as one: obs [B, O], action [B, A], zsa [B, Z], zs [B, Z] -> [N, B]"""
     return ensemble(SaleCritic, ensemble_size, hidden)

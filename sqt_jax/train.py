@@ -121,7 +121,9 @@ def make_trainer(
         timestep, transition = rollout.step(env, state.timestep, behaviour)
         over = timestep.terminated | timestep.truncated
         episodes, episode_return = state.episodes.add(transition.reward, over)
-        agent_state = agent.observe(state.agent, episode_return, over & learn)
+        # An episode with random actions of the warm-up in it is no policy's.
+        begun = state.env_steps - num_envs * state.episodes.running_length.astype(jnp.int32)
+        agent_state = agent.observe(state.agent, episode_return, over & learn & (begun >= config.warmup_steps))
         replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):
@@ -204,6 +206,9 @@ def state_axes(state: TrainState) -> Any:
 
 def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
     """Compiles a trainer over members; each function compiles once, whatever the number of steps.
+
+    Members share the leaves of `members.SHARED_LEAVES`, by name; a counter of another name becomes each member's own,
+    and a `lax.cond` on it computes both branches.
 
     Args:
       layout: the members and the devices that they are spread over; None is any number of them on the default device.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 Array = jax.Array
 Params = Any  # a pytree of arrays
-State = Any  # a pytree of arrays that only its owner looks into
+State = Any  # a pytree of arrays that only its owner looks into, but for what `Agent` says
 Metrics = dict[str, Array]  # scalars by name
 
 
@@ -69,6 +69,12 @@ class Agent(NamedTuple):
 
     `update(state, batch, key)` is `update_with_noise(state, batch, draw_noise(key, batch))`: every random number of
     an update is in the `noise`, so that a test can pass its own.
+
+    What the train loop reads of an agent's state, so that one of your own needs it too: `scalars.gamma`, `diverged` []
+    bool, and `gradient_steps` [] int32 (equal in all members, by that name: `members.SHARED_LEAVES`).
+
+    `td_error` is the largest |TD error| over the critics before the step, 0 once the agent has diverged. Metrics are []
+    each, NaN where this update did not measure them (`actor_loss` in an update without the actor's step).
     """
 
     init: Callable[..., State]  # (key, scalars=None) -> state
@@ -76,12 +82,13 @@ class Agent(NamedTuple):
     update: Callable[[State, Transition, Array], tuple[State, Array, Metrics]]  # -> (state, td_error [B], metrics)
     draw_noise: Callable[[Array, Transition], Any]  # (key, batch) -> noise
     update_with_noise: Callable[[State, Transition, Any], tuple[State, Array, Metrics]]
-    td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]  # (state, batch, noise) -> [B], terms
+    # (state, batch, noise) -> [B], and its terms by name: penalty [] or [B]; next_log_prob [B] with an entropy term
+    td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]
     policy: Callable[[State], Params]  # state -> what deterministic acting needs of it
     policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
     q_values: Callable[[State, Array, Array], Array]  # (state, obs [B, O], action [B, A]) -> [N, B], the critics
-    # The policy whose values the critics estimate, where that is not the deterministic one: (state, obs [B, O], key) ->
-    # action [B, A] and its entropy bonus [B].
+    # The policy whose values the critics estimate, where that samples: (state, obs [B, O], key) -> action [B, A] and
+    # its entropy bonus [B].
     valued_act: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
     # After each step of the environments: (state, returns of the running episodes [E], which of them ended [E] bool) ->
     # state. TD7 assesses policies by it, and never acts otherwise than at the start without it.
@@ -99,8 +106,10 @@ class Replay(NamedTuple):
     capacity: int
     init: Callable[[], State]
     insert: Callable[[State, Transition], State]  # E new transitions at once
-    sample: Callable[[State, Array], tuple[Transition, Array]]  # (state, key) -> B transitions, their rows [B]
-    feedback: Callable[[State, Array, Array, Array], State]  # (state, rows [B], td_error [B], gradient_steps) -> state
+    # (state, key) -> B transitions, their rows [B]; something has to be there (`size`), else they are all zeros
+    sample: Callable[[State, Array], tuple[Transition, Array]]
+    # (state, rows [B], td_error [B] as `Agent.update` gives it, gradient_steps) -> state
+    feedback: Callable[[State, Array, Array, Array], State]
     size: Callable[[State], Array]  # state -> [] int32: the newest transitions that are all there
     rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows to keep on disk [count, floats]
     with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state: they are back
@@ -108,12 +117,15 @@ class Replay(NamedTuple):
 
 
 class Scalars(NamedTuple):
-    """Settings that are traced, so that a sweep over their values compiles once."""
+    """Settings that are traced, so that a sweep over their values compiles once.
 
-    penalty_coef: Array | float
+    Traced values cannot be checked, and an algorithm ignores those that it has no use for; `make_config` refuses both.
+    """
+
+    penalty_coef: Array | float  # of the variants with a penalty
     lr: Array | float
     gamma: Array | float
-    tau: Array | float
+    tau: Array | float  # of soft target updates: not with SALE networks (td7)
     temperature: Array | float  # SAC's; the start value where it is learned
 
     def as_arrays(self) -> "Scalars":

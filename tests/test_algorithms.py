@@ -100,9 +100,21 @@ def test_rows_name_settings_that_exist(algo):
 
 
 def test_settings_override_the_row():
-    agent = make_config("td3_sqt", "ant", penalty_coef=0.25, policy_delay=3, penalty="transition_std").agent
-    assert (agent.penalty_coef, agent.policy_delay, agent.penalty) == (0.25, 3, "transition_std")
+    agent = make_config("td3_sqt", "ant", penalty_coef=0.25, policy_delay=3).agent
+    assert (agent.penalty_coef, agent.policy_delay, agent.penalty) == (0.25, 3, "batch_std")
     assert make_config("redq", "ant", updates_per_step=20).train.updates_per_step == 20
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_no_other_penalty_than_the_names_own_is_taken(algo):
+    """A run would be another algorithm than its name says."""
+    own = make_config(algo, "ant").agent.penalty
+    for penalty in ("none", "batch_std", "transition_std"):
+        if penalty == own:
+            assert make_config(algo, "ant", penalty=penalty) == make_config(algo, "ant")
+        else:
+            with pytest.raises(ConfigError, match="--penalty: "):
+                make_config(algo, "ant", penalty=penalty)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -130,4 +130,7 @@ def test_actions_without_bounds_are_refused():
     env = Ladder()
     env.action_space = type("Box", (), {"low": np.array([-np.inf]), "high": np.array([1.0])})()
     with pytest.raises(ValueError, match="an action space with bounds"):
+        evaluate_policy(lambda obs: obs[:, :1], env)
+    env.action_space = type("Discrete", (), {"n": 2})()
+    with pytest.raises(ValueError, match="an action space with bounds"):
         evaluate_policy(lambda obs: obs, env)

@@ -251,6 +251,11 @@ def test_the_priority_is_the_clipped_error_to_the_power(maybe_jit):
     np.testing.assert_array_equal(lap.priority(error, 0.0, 1.0), np.ones(4))
 
 
+def test_a_signed_error_counts_by_its_size_and_one_that_is_not_finite_as_none():
+    error = jnp.array([-32.0, jnp.nan, jnp.inf, -jnp.inf])
+    np.testing.assert_allclose(lap.priority(error, 0.4, 1.0), [4, 1, 1, 1], rtol=1e-6)
+
+
 def test_feedback_sets_the_priorities_of_its_rows_alone():
     *_, feedback = compiled()
     rows = np.arange(0, 960, 60, dtype=np.int32)

@@ -98,6 +98,12 @@ def test_models_own_solver_settings_are_reachable_and_give_the_same_step():
     assert error.max() < 5e-3
 
 
+@pytest.mark.parametrize("name", ["iterations", "ls_iterations"])
+def test_a_solver_without_steps_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: takes a whole number of at least 1, .* not 0"):
+        envs.make("ant", **{name: 0})
+
+
 @pytest.mark.parametrize(("options", "expected"), [({}, (8, 8)), ({"iterations": 3, "ls_iterations": 5}, (3, 5))])
 def test_solver_options_reach_the_solver(options, expected, monkeypatch):
     assert solver_settings(options, monkeypatch) == expected

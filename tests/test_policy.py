@@ -42,6 +42,18 @@ def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
         np.testing.assert_allclose(policy.load_policy(tmp_path / "policy", member)(obs), expected, rtol=1e-5)
 
 
+def test_one_agents_state_without_an_axis_of_members_is_refused(tmp_path):
+    """Its first rows would be taken for members."""
+    env = probe_envs.constant_reward()
+    config = algorithms.make_config("td3", "cheetah", hidden=(8, 8))
+    state = algorithms.agent_of(config, env).init(jax.random.key(1))
+    with pytest.raises(ValueError, match="td3's with a leading axis of members"):
+        policy.save_policy(tmp_path / "policy", config, env, state, members=1)
+    assert not (tmp_path / "policy").exists()
+    policy.save_policy(tmp_path / "policy", config, env, jax.tree.map(lambda leaf: leaf[None], state))
+    assert policy.load_policy(tmp_path / "policy")(jnp.zeros((3, env.observation_size))).shape == (3, env.action_size)
+
+
 def test_an_existing_policy_is_not_overwritten(tmp_path):
     saved("td3", tmp_path / "policy")
     with pytest.raises(FileExistsError):

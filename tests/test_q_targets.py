@@ -253,6 +253,35 @@ def test_a_split_batch_has_the_whole_batchs_penalty(inside):
     assert np.abs(alone.reshape(8) - whole).max() > 1e-3
 
 
+# Refused
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        {"reward": (3, 1)},  # torch's habit: a target of [B, B]
+        {"discount": (3, 1)},
+        {"next_q": (3,)},  # one critic: the minimum would be over the batch
+        {"next_q": (2, 4)},
+        {"entropy_term": (3, 1)},
+        {"next_q": (2,), "reward": (), "discount": ()},  # one transition at a time: SQT's penalty needs the batch
+    ],
+    ids=str,
+)
+def test_shapes_that_would_broadcast_to_something_else_are_refused(maybe_jit, shapes):
+    shapes = {"next_q": (2, 3), "reward": (3,), "discount": (3,), "entropy_term": (3,)} | shapes
+    values = {name: jnp.ones(shape) for name, shape in shapes.items()}
+    refused = r"\[N, B\], \[B\] and \[B\], not|have to leave \(3,\) of the values, not \(3, 3\)"
+    with jax.numpy_rank_promotion("allow"), pytest.raises(ValueError, match=refused):  # as users have it
+        maybe_jit(lambda values: q_targets.td_target(**values, gamma=0.9))(values)
+
+
+@pytest.mark.parametrize("size", [0, 3])
+def test_a_subset_of_more_critics_than_there_are_is_refused(size):
+    with pytest.raises(ValueError, match=f"takes 1 to 2 of the critics, not {size}"):
+        q_targets.random_subset(jax.random.key(0), 2, size)
+
+
 # Compiled
 
 

@@ -271,6 +271,11 @@ def test_past_the_switch_of_gradient_steps_one_episode_does_not_end_an_assessmen
     assert late.checkpoints.assessments == 1
 
 
+def test_episodes_of_several_environments_are_refused(three_policies):
+    with pytest.raises(ValueError, match=r"td7 takes one environment: .* not \(2,\)"):
+        AGENT.observe(three_policies, jnp.array([5.0, 6.0]), jnp.array([True, False]))
+
+
 def test_the_status_tells_of_checkpoints_and_bounds(three_policies):
     status = AGENT.status(three_policies)
     assert status["assessments"] == status["checkpoint_refreshes"] == 0 and np.isnan(status["best_min_return"])
@@ -332,6 +337,16 @@ def test_the_warm_ups_episodes_are_not_assessed(trained):
     checkpoints = trained.warm.agent.checkpoints
     assert np.all(checkpoints.assessments == 0) and np.all(checkpoints.refreshes == 0)
     assert np.all(checkpoints.best_min_return == np.float32(-1e8)) and np.all(checkpoints.min_return == 1e8)
+
+
+def test_an_episode_that_the_warm_up_began_is_not_assessed(trained):
+    """The warm-up's 20 steps, the last two of them with updates: the fourth episode is still one of the warm-up."""
+    scalars = jax.tree.map(lambda value: jnp.full(MEMBERS, value), CONFIG.scalars())
+    state = trained.sweep.advance(trained.sweep.init(jax.random.split(KEY, MEMBERS), scalars), 18, False)
+    state = trained.sweep.advance(state, 2, True)
+    np.testing.assert_array_equal(trained.sweep.measure(state)["assessments"], np.zeros(MEMBERS))
+    state = trained.sweep.advance(state, EPISODE, True)
+    np.testing.assert_array_equal(trained.sweep.measure(state)["assessments"], np.ones(MEMBERS))
 
 
 def test_each_training_episode_is_assessed_by_the_rule(trained):

@@ -78,6 +78,7 @@ def lower_best(config: AgentConfig, state: Checkpoints, gradient_steps: Array) -
 
 
 def status(state: Checkpoints) -> Metrics:
+    """Counts and the best minimum, [] each; NaN before the first refresh."""
     return {
         "assessments": state.assessments,
         "checkpoint_refreshes": state.refreshes,

@@ -80,6 +80,7 @@ def actions(config: AgentConfig) -> Actions:
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
+    """TD3 for observations [B, O] and actions [B, A] of these sizes."""
     acting = actions(config)
     actor_net = networks.actor(action_size, config.hidden, acting.gaussian)
     critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)

@@ -71,6 +71,7 @@ class TD7State(NamedTuple):
 
 
 def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
+    """TD7 for observations [B, O] and actions [B, A] of these sizes."""
     return make_sale_agent(config, observation_size, action_size, td3.actions(config), assessed=True)
 
 
@@ -127,6 +128,8 @@ def make_sale_agent(
     def observe(state: TD7State, episode_return: Array, ended: Array) -> TD7State:
         if not state.checkpoints:
             return state
+        if episode_return.shape != (1,) or ended.shape != (1,):
+            raise ValueError(f"td7 takes one environment: returns and ends of [1], not {episode_return.shape}")
         checkpoints = assessment.assess(
             config,
             state.checkpoints,
@@ -144,7 +147,7 @@ def make_sale_agent(
         next_action, next_log_prob = acting.next_action(target_output, noise)
         zsa = encoder_net.zsa(state.fixed_encoder_target, zs, next_action)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action, zsa, zs)
-        return critics.td_target(
+        target, terms = critics.td_target(
             config,
             state.scalars,
             batch,
@@ -153,6 +156,7 @@ def make_sale_agent(
             entropy_term=state.scalars.temperature * next_log_prob if acting.entropy else 0.0,
             value_bounds=(bounds.low, bounds.high) if bounds else None,
         )
+        return target, terms | ({"next_log_prob": next_log_prob} if acting.entropy else {})
 
     def update_encoder(state: TD7State, batch: Transition) -> tuple[TD7State, Array]:
         def loss_fn(encoder):

@@ -34,7 +34,8 @@ def simulators(name: str) -> tuple[str, ...]:
 def make(name: str, physics: str | None = None, **options: Any) -> Environment:
     """Make the environment `name` (an alias of it, or a Gymnasium id) on a simulator, with that simulator's options.
 
-    Without `physics`, on the first of its `simulators`.
+    Without `physics`, on the first of its `simulators`. Options are, of mjx and warp, `iterations` and `ls_iterations`
+    (most steps of the constraint solver and of its line search, None: the model file's); of mujoco `num_threads`.
 
     Raises:
       ValueError: the environment or the simulator is unknown, or the simulator cannot run here (`lacks`).

@@ -118,8 +118,11 @@ def newton_model(model: mujoco.MjModel, iterations: int | None, ls_iterations: i
     """A copy of the model to be solved by Newton's method, with these limits; None leaves the model's own.
 
     Raises:
-      ValueError: the model has activation states, or an integrator other than Euler and RK4.
+      ValueError: the model has activation states, or an integrator other than Euler and RK4; a limit below 1.
     """
+    for name, limit in {"iterations": iterations, "ls_iterations": ls_iterations}.items():
+        if limit is not None and limit < 1:
+            raise ValueError(f"{name}: takes a whole number of at least 1, or None for the model file's, not {limit}")
     model = copy.copy(model)
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if model.na or integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
