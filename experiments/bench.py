@@ -21,6 +21,7 @@ import os
 import platform
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import files
+from experiments import command_line, files
 from experiments.benchmarks import compare, growth, kernels, operations
 from experiments.benchmarks.measure import (
     REPLAYS,
@@ -45,6 +46,7 @@ from experiments.benchmarks.measure import (
 )
 from experiments.benchmarks.measure_checkpoints import bench_checkpoint
 from experiments.benchmarks.measure_memory import bench_memory
+from experiments.evidence.published import PAPERS_TASKS
 from experiments.running import runtime
 from sqt_jax import algorithms, envs
 
@@ -65,8 +67,7 @@ NAMED: dict[str, dict[str, Any]] = {
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES + MORE_SUITES)}.")
 flags.DEFINE_enum("suite", None, list(NAMED), "Flags by name, which those that are given win over.")
-PAPERS_TASKS = ["cheetah", "walker", "ant", "humanoid"]
-flags.DEFINE_list("tasks", PAPERS_TASKS, "Tasks; the suite replay takes the rows of the first one.")
+flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks; the suite replay takes the rows of the first one.")
 flags.DEFINE_list("physics", None, "Physics of the suites env, loop and memory; by itself all that can run here.")
 flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop and memory.")
@@ -91,6 +92,9 @@ def check_flags() -> None:
     for name, value in NAMED.get(FLAGS.suite, {}).items():
         if not FLAGS[name].present:
             FLAGS[name].value = value
+    for name in ("tasks", "algos", "members", "devices", "capacities", "physics"):
+        if FLAGS[name].value == []:  # of the suites alone none may be asked for, beside --compare
+            sys.exit(f"--{name}: takes at least one")
     known = {
         "suites": SUITES + MORE_SUITES,
         "compare": compare.NEEDS,
@@ -111,11 +115,23 @@ def check_flags() -> None:
         sys.exit(f"--members: takes one number where growth is measured, not {','.join(FLAGS.members)}")
     if FLAGS.json and (Path(FLAGS.json).is_dir() or not Path(FLAGS.json).absolute().parent.is_dir()):
         sys.exit(f"--json: takes a file in a folder that is there, not {FLAGS.json!r}")
+    if "growth" in FLAGS.suites:
+        with leaving():
+            command_line.refuse_folder("--figures", Path(FLAGS.figures))
     for peer in FLAGS.compare:
         if not {*compare.ALGORITHMS[peer]} & {*FLAGS.algos}:
             sys.exit(f"--algos: takes some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
         if compare.lacks(peer, FLAGS.peer_python):
             sys.exit(f"--compare: {peer} needs a Python with {compare.INSTALL[peer]}; --peer_python names it")
+
+
+@contextmanager
+def leaving() -> Iterator[None]:
+    """Leaves with the line of a `UsageError`."""
+    try:
+        yield
+    except command_line.UsageError as error:
+        sys.exit(str(error))
 
 
 def solver_limits() -> dict[str, dict[str, int]]:
@@ -287,8 +303,11 @@ def show(found: Sequence[Row], peak: float) -> None:
     Console().print(table)
     print(markdown(found, peak))
     print("\n".join(ratios(found) + compare.ratios(found)))
-    for path in growth.draw(found, Path(FLAGS.figures)):
-        print(path)
+    try:
+        for path in growth.draw(found, Path(FLAGS.figures)):
+            print(path)
+    except OSError as error:
+        sys.exit(f"--figures={FLAGS.figures}: takes a folder that can be written: {error.strerror}")
 
 
 def main(argv: Sequence[str]) -> None:

@@ -58,11 +58,20 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         flag, _, rest = message.removeprefix("argument ").partition(": ")
         if "expected one argument" in rest:
-            takes = next(action for action in self._actions if flag in action.option_strings)
-            rest = f"takes {takes.metavar}"
+            rest = _takes(next(action for action in self._actions if flag in action.option_strings))
         elif "ignored explicit argument" in rest:
             rest = "is a switch and takes no value"
         raise UsageError(f"{flag}: {rest}" if rest else message)
+
+
+def _takes(action: argparse.Action) -> str:
+    """What a flag takes, as its type says of no text at all."""
+    try:
+        if callable(action.type):
+            action.type("")
+    except argparse.ArgumentTypeError as error:
+        return str(error).removesuffix(", not ''")
+    return f"takes a {str(action.metavar).lower()}"
 
 
 def one_of(*choices: str) -> Callable[[str], str]:
@@ -111,14 +120,30 @@ def file(text: str) -> Path:
 
 def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
     """Raises `UsageError` where files would be replaced that may not be, or `out` is no folder."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"--out={out}: takes a folder, which this is not")
+    refuse_folder("--out", out)
     there = [name for name in names if (out / name).exists() or (out / name).is_symlink()]
     if there and not overwrite:
         raise UsageError(f"--out={out}: {there[0]} is there already; takes another folder, or --overwrite replaces it")
     for name in there:
         if (out / name).is_dir():
             raise UsageError(f"--out={out}: {name} is a folder; takes a folder without it")
+
+
+def refuse_folder(flag: str, path: Path) -> None:
+    """Raises `UsageError` where a folder could not be made or written later."""
+    try:
+        if path.exists() and not path.is_dir():
+            raise UsageError(f"{flag}={path}: takes a folder, which this is not")
+        if not _can_be_written(path):
+            raise UsageError(f"{flag}={path}: takes a folder that can be written")
+    except OSError as error:  # a name that is too long
+        raise UsageError(f"{flag}={path}: takes a folder that can be written: {error.strerror}") from None
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files can be made in a folder, or the folder itself, where it is not there yet."""
+    nearest = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
 
 
 def write_file(out: Path, content: bytes) -> None:
@@ -142,8 +167,7 @@ def refuse_file(flag: str, path: Path, overwrite: bool) -> None:
             raise UsageError(f"{flag}={path}: takes a file, which this folder is not")
         if os.path.lexists(path) and not overwrite:
             raise UsageError(f"{flag}={path}: is there already; takes another file, or --overwrite replaces it")
-        nearest = next(parent for parent in path.absolute().parents if parent.exists())
-        if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+        if not _can_be_written(path.parent):
             raise UsageError(f"{flag}={path}: takes a file in a folder that can be written")
     except OSError as error:  # a name that is too long
         raise UsageError(f"{flag}={path}: takes a file that can be written: {error.strerror}") from None

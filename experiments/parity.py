@@ -2,7 +2,7 @@
 
 For each task and version: whole episodes on MuJoCo C against Gymnasium's own environment, single control steps of each
 physics from the same states, starts and episodes in distribution, and the speed of five environments side by side.
-The benchmark's flags --tasks, --physics, --solver, --seconds and --repeats are understood.
+The benchmark's flags --tasks, --physics, --solver, --seconds and --repeats are understood, and no others of its.
 """
 
 import sys
@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags, logging
 
-from experiments.bench import check_flags, machine, physics_here, solver_limits
+from experiments import bench, command_line
+from experiments.bench import check_flags, leaving, machine, physics_here, solver_limits
 from experiments.benchmarks.measure import env_steps
 from experiments.benchmarks.timing import measure_in_turns
 from experiments.gymnasium_parity.distributions import (
@@ -38,6 +39,7 @@ flags.DEFINE_integer("starts", 2_000, "Starts of episodes that are compared.", l
 flags.DEFINE_integer("episodes", 60, "Episodes of a policy of random weights that are compared.", lower_bound=2)
 flags.DEFINE_string("out", "", "The report's file; it is printed in any case.")
 
+TAKEN = ("tasks", "physics", "solver", "seconds", "repeats")  # of the benchmark's flags
 MEMBERS = 5  # environments side by side in the timing
 
 # Starts and sizes of the random actions of the compared episodes.
@@ -194,9 +196,20 @@ def cases(simulators: Sequence[str]) -> dict[str, tuple[str, dict[str, int]]]:
     return found
 
 
+def refuse_others() -> None:
+    """Leaves with one line where a flag was given that the benchmark alone has a use for."""
+    for flag in FLAGS.flags_by_module_dict()[bench.__name__]:
+        if flag.present and flag.name not in TAKEN:
+            sys.exit(f"--{flag.name}: has no effect here; takes of the benchmark's flags --{', --'.join(TAKEN)}")
+
+
 def main(argv: Sequence[str]) -> None:
     del argv  # what absl leaves of it: no flags
+    refuse_others()
     check_flags()
+    if FLAGS.out:
+        with leaving():
+            command_line.refuse_file("--out", Path(FLAGS.out), overwrite=True)
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
     rows = cases(physics_here())
@@ -218,7 +231,8 @@ def main(argv: Sequence[str]) -> None:
     text = report(episodes, steps, starts, played, " ".join(["python -m experiments.parity", *sys.argv[1:]]))
     print(text)
     if FLAGS.out:
-        Path(FLAGS.out).write_text(text)
+        with leaving():
+            command_line.write_file(Path(FLAGS.out), text.encode())
 
 
 if __name__ == "__main__":

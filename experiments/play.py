@@ -33,6 +33,7 @@ INTERRUPTED = 130
 MAX_SEED = 2**32 - 1
 MAX_BYTES = 10_000_000  # of config.json
 BRAX = "brax:"
+SIZE = (640, 480)
 
 
 class Task(NamedTuple):
@@ -83,7 +84,7 @@ def parser() -> Parser:
     )
     add("--physics", metavar="NAME", help="what computes the episodes (mujoco; of brax:ENV what the run trained on)")
     add("--video", type=film, metavar="FILE", help="film.mp4, .gif or .html to write; of brax:ENV .html alone")
-    add("--size", type=size, default=(640, 480), metavar="WIDTHxHEIGHT", help="of the film, in pixels (640x480)")
+    add("--size", type=size, metavar="WIDTHxHEIGHT", help="of the film, in pixels (640x480)")
     add("--camera", default="", metavar="NAME", help="one of the model's (the one that follows the robot)")
     add("--overwrite", action="store_true", help="replace a film that is there")
     return made
@@ -131,12 +132,17 @@ def _prepare(path: Path, options: argparse.Namespace) -> None:
     if not path.is_dir():
         raise UsageError(f"{path}: there is no such folder")
     if options.video is None:
+        for flag, given in {"--size": options.size, "--overwrite": options.overwrite}.items():
+            if given:
+                raise UsageError(f"{flag}: has no effect without --video")
         return
     command_line.refuse_file("--video", options.video, options.overwrite)
     name = _env_name(path)
     if name.startswith(BRAX):
         if films.format_of(options.video) != "html":
             raise UsageError(f"--video={options.video}: takes a file with the ending .html, as {name} is Brax's")
+        if options.size:
+            raise UsageError(f"--size: Brax's viewer has its own; takes no size with {name}")
         return
     try:
         os.environ["MUJOCO_GL"] = graphics.choose()
@@ -200,6 +206,7 @@ def _film(
     from experiments.running import progress
 
     path: Path = options.video
+    width, height = options.size or SIZE
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if task.env.name.startswith(BRAX):
@@ -212,13 +219,12 @@ def _film(
         total = sum(episode.total for episode in played) / len(played)
         caption = f"{caption}; return {total:,.1f}"
         with progress.counting("rendering, pictures", len(shown), console) as done:
-            pictures = _counted(rendering.frames(task.scene, shown, options.size, options.camera), done)
+            pictures = _counted(rendering.frames(task.scene, shown, (width, height), options.camera), done)
             written = films.write(path, pictures, every * task.period, caption)
     except OSError as error:
         raise UsageError(f"--video={path}: takes a file that can be written: {error.strerror or error}") from None
     of = "every state" if every == 1 else f"one state in {every}"
     rate = 1 / (every * task.period)
-    width, height = options.size
     print(f"{path}: {width}x{height}, {len(shown):,} pictures, {rate:.4g} per second ({of}), {written / 1e6:,.2f} MB")
 
 

@@ -36,10 +36,6 @@ EVALUATION_COLUMNS = (
 )
 
 
-class RunExists(Exception):
-    """The run directory already holds a run."""
-
-
 class NotARun(Exception):
     """The directory holds something else than a run."""
 
@@ -107,7 +103,6 @@ class Records:
         cut off, for training writes it again.
 
     Raises:
-      RunExists: there is something in the folder already, and no run is resumed.
       Shortened: the tables of a run that is resumed have lost rows.
       OSError: the folder cannot be made or written.
     """
@@ -122,8 +117,6 @@ class Records:
         warn: Callable[[str], None] = lambda line: None,
     ):
         path.mkdir(parents=True, exist_ok=True)
-        if resumed_at is None and (path / "evaluations.csv").exists():
-            raise RunExists
         env_steps, lengths = resumed_at or (None, {})
         for table in ("evaluations", "metrics"):  # before one of them is cut
             file = path / f"{table}.csv"
@@ -196,7 +189,9 @@ class Records:
                     "return_std": float(report.returns[index].std()),
                     "episode_length_mean": float(report.lengths[index].mean()),
                 }
-                measured = {name: metrics.get(name, math.nan) for name in ("q_mean", "q_std")}
+                # A member that has diverged is frozen: no table may count its critics beside those that learn.
+                counts = not math.isnan(evaluation["return_mean"])
+                measured = {name: metrics.get(name, math.nan) if counts else math.nan for name in ("q_mean", "q_std")}
                 evaluation["value_bias"] = judged.get("value_bias", math.nan)
                 room &= self._evaluations.write(row | evaluation | measured)
             if self._metrics and report.metrics:

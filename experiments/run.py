@@ -4,11 +4,13 @@ Exit codes: 0 done; 1 the results could not be written; 2 bad usage (one line, n
 130 interrupted.
 """
 
+import math
 import os
 import shlex
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
+from experiments.command_line import UsageError, printable
 from experiments.running import flag_table, flags, progress, runtime
 from experiments.running.loop import BEGINNING, Outcome, Position, train_loop
 from sqt_jax.algorithms import agent_of, make_trainer, replay_of
@@ -58,6 +61,10 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
         if not plan.resumed:
             _claim(plan, command)
         tables = stack.enter_context(_tables(plan, restored, display.message))
+        if restored and _is_finished(plan, restored):
+            if not plan.options.quiet:
+                console.print(f"{plan.path} is finished", soft_wrap=True, highlight=False, markup=False)
+            return DIVERGED if restored.position.diverged else DONE
         if plan.resumed:
             _go_on(plan, plan.resumed, restored, command)
             store.remove_others()
@@ -65,8 +72,8 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
             _announce(console, plan, restored, store.sizes(template))
         outcome = _train(plan, sweep, restored, tables, store, display, lambda: bool(stop))
         try:
-            summary = tables.summary(outcome)
             curves = _results(plan, outcome)
+            summary = tables.summary(outcome)  # the last file: it says that the run has ended
         except OSError as error:
             display.message(f"the results cannot be written: {error}")
             return FAILED
@@ -93,14 +100,14 @@ def _lock(plan: "Plan", stack: ExitStack) -> None:
         stack.enter_context(files.locked(plan.path))
     except files.Busy as busy:
         flag = f"--resume={plan.path}" if plan.resumed else f"--name={plan.path.name}"
-        raise flags.UsageError(f"{flag}: process {busy.process} is at work on {plan.path}; takes another run") from None
+        raise UsageError(f"{flag}: process {busy.process} is at work on {plan.path}; takes another run") from None
     except OSError as error:
         raise _cannot_write(plan, error) from None
 
 
-def _cannot_write(plan: "Plan", error: OSError) -> flags.UsageError:
+def _cannot_write(plan: "Plan", error: OSError) -> UsageError:
     flag = f"--resume={plan.path}" if plan.resumed else f"--out={plan.options.out}"
-    return flags.UsageError(f"{flag}: takes a folder that can be written: {error}")
+    return UsageError(f"{flag}: takes a folder that can be written: {error}")
 
 
 def _start(plan: "Plan") -> tuple[Array, Scalars]:
@@ -120,11 +127,39 @@ def _restored(plan: "Plan", store: "Checkpoints", template: TrainState) -> "Rest
     try:
         restored = store.restore(template)
     except manifests.Refused as error:
-        raise flags.UsageError(f"--resume={plan.path}: takes a run with checkpoints to go on from; {error}") from None
-    # A run that died before its first checkpoint has lost nothing that it would not write again.
-    if restored is None and (plan.resumed.content["output"].get("checkpoint_every") == 0 or _summary(plan).exists()):
-        raise flags.UsageError(f"--resume={plan.path}: takes a run with checkpoints to go on from; it has none")
+        raise UsageError(f"--resume={plan.path}: takes a run with checkpoints to go on from; {error}") from None
+    if restored is None:
+        _refuse_to_begin_again(plan.path, plan.resumed.content["output"].get("checkpoint_every"))
     return restored
+
+
+def _refuse_to_begin_again(path: Path, checkpoint_every: object) -> None:
+    """Where there is more to lose than what a run writes before its first checkpoint, and would write again."""
+    refusal = f"--resume={path}: takes a run with checkpoints to go on from; it has none"
+    if checkpoint_every == 0 or (path / "summary.json").exists():
+        raise UsageError(refusal)
+    # The first checkpoint is on disk when the second one is due.
+    reached = _reached(path)
+    if isinstance(checkpoint_every, int) and reached > 2 * checkpoint_every:
+        raise UsageError(
+            f"{refusal}, and its evaluations reach step {reached:,}; --overwrite or another --name begins anew"
+        )
+
+
+def _reached(path: Path) -> int:
+    """The env steps of the last row of evaluations.csv; 0 where there is none."""
+    from experiments import records
+
+    try:
+        return int(max(records.read_evaluations(path / "evaluations.csv")["env_steps"], default=0))
+    except (OSError, ValueError, KeyError):
+        return 0
+
+
+def _is_finished(plan: "Plan", restored: "Restored") -> bool:
+    """Whether nothing is left to do: its summary stays that of the process that ended it."""
+    at = restored.position
+    return at.env_steps == at.evaluated == plan.train.steps and _summary(plan).exists()
 
 
 def _summary(plan: "Plan") -> Path:
@@ -135,21 +170,19 @@ def _claim(plan: "Plan", command: Sequence[str]) -> None:
     """Makes the folder a run: writes config.json into it, where nothing else is or what is there may be replaced."""
     from experiments import records
     from experiments.running import described
-    from experiments.running.plan import taken
+    from experiments.running.plan import not_a_run, taken
 
     try:
         if plan.options.overwrite:
             records.remove_run(plan.path)
         if records.is_taken(plan.path):
-            raise flags.UsageError(taken(plan.path))
+            raise UsageError(taken(plan.path))
         content = described.describe(plan.members, plan.swept, command, plan.options.preset, plan.output)
         described.write(plan.path, content)
     except records.NotARun:
-        raise flags.UsageError(
-            f"--overwrite: {plan.path} holds other things than a run; takes a folder with a run alone"
-        ) from None
+        raise UsageError(not_a_run(plan.path)) from None
     except OSError as error:
-        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
+        raise _cannot_write(plan, error) from None
 
 
 def _go_on(plan: "Plan", run: "Described", restored: "Restored | None", command: Sequence[str]) -> None:
@@ -161,7 +194,7 @@ def _go_on(plan: "Plan", run: "Described", restored: "Restored | None", command:
         described.write(plan.path, described.resumed(run.content, plan.train.steps, plan.output, at, command))
         _summary(plan).unlink(missing_ok=True)
     except OSError as error:
-        raise flags.UsageError(f"--resume={plan.path}: takes a folder that can be written: {error}") from None
+        raise _cannot_write(plan, error) from None
 
 
 def _tables(plan: "Plan", restored: "Restored | None", warn: Callable[[str], None]) -> "Records":
@@ -174,15 +207,13 @@ def _tables(plan: "Plan", restored: "Restored | None", warn: Callable[[str], Non
     try:
         return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, warn)
     except csv_table.Shortened as error:
-        raise flags.UsageError(
+        raise UsageError(
             f"--resume={plan.path}: {error} has lost rows since the checkpoint; takes a run with whole tables"
         ) from None
     except csv_table.OtherColumns as error:
-        raise flags.UsageError(
-            f"--resume={plan.path}: takes a run of this version; {error} has other columns"
-        ) from None
+        raise UsageError(f"--resume={plan.path}: takes a run of this version; {error} has other columns") from None
     except OSError as error:
-        raise flags.UsageError(f"--out={plan.options.out}: takes a folder that can be written: {error}") from None
+        raise _cannot_write(plan, error) from None
 
 
 def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes: tuple[int, int]) -> None:
@@ -273,9 +304,8 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
         from experiments.running.plan import make_plan
 
         return run(make_plan(options, env), argv)
-    except flags.UsageError as error:
-        line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error))
-        print(line, file=sys.stderr)
+    except UsageError as error:
+        print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
     except KeyboardInterrupt:  # before the training, or the second one
         return INTERRUPTED
@@ -283,8 +313,13 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
 
 @contextmanager
 def _stop_on_signal() -> Iterator[list[int]]:
-    """Gathers SIGINT and SIGTERM in a list instead of dying of the first; a second one ends the process at once."""
+    """Gathers SIGINT and SIGTERM in a list instead of dying of the first; a second one ends the process at once.
+
+    A SIGTERM within a second of another is the same: a batch system's reaches this process and `experiments.sweep`,
+    which passes it on.
+    """
     received: list[int] = []
+    terminated = -math.inf
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
 
@@ -293,6 +328,11 @@ def _stop_on_signal() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
     def handle(number: int, _: FrameType | None) -> None:
+        nonlocal terminated
+        if number == signal.SIGTERM:
+            since, terminated = time.monotonic() - terminated, time.monotonic()
+            if since < 1:
+                return
         if received:
             # Not by an exception: it could strike inside a callback of the compiled program.
             os._exit(INTERRUPTED)

@@ -21,7 +21,7 @@ GROWTH_MIB = 64  # more than allocators' noise, far less than a leak of a few by
 FLAGS = flags.FLAGS
 flags.DEFINE_integer("steps", 10_000_000, "Environment steps in all.", lower_bound=1)
 flags.DEFINE_integer("envs", 64, "Environments side by side.", lower_bound=1)
-flags.DEFINE_integer("rounds", 5, "Times that each task has its turn.", lower_bound=1)
+flags.DEFINE_integer("rounds", 5, "Times that each task has its turn.", lower_bound=2)
 
 
 def make_part(task: str, num_envs: int):

@@ -5,30 +5,36 @@ alone and those that were interrupted are gone on with, so that the same command
 of all presets have the same names: what one has trained, another finds.
 """
 
+import hashlib
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 from absl import app
 from absl import flags as absl_flags
 
+from experiments.evidence.published import PAPERS_TASKS
 from experiments.running.progress import format_seconds
 from sqt_jax.names import unknown
 
-TASKS = ("cheetah", "walker", "ant", "humanoid")
 BASES = ("td3", "sac", "td7")
 DONE, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 2, 3, 130
+MAX_NAME = 200
 
 
 class Preset(NamedTuple):
     """A grid of runs."""
 
     algos: tuple[str, ...]
-    tasks: tuple[str, ...] = TASKS
+    tasks: tuple[str, ...] = PAPERS_TASKS
     settings: tuple[str, ...] = ()  # further flags of each run
 
 
@@ -55,10 +61,26 @@ def cells(preset: Preset, algos: Sequence[str], tasks: Sequence[str], out: Path,
     for task in tasks or preset.tasks:
         for algo in algos or preset.algos:
             flags = (*preset.settings, *rest)
-            name = "_".join(word.lstrip("-").replace("/", "-") for word in sorted(flags)) or "default"
-            command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name[:200]}", "--resume", *flags)
-            found.append(Cell(task, algo, out / task / algo / name[:200], command))
+            name = name_of(flags)
+            command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name}", "--resume", *flags)
+            found.append(Cell(task, algo, out / task / algo / name, command))
     return found
+
+
+def name_of(flags: Sequence[str]) -> str:
+    """A run's name, by its flags: a finished run is known by its name alone.
+
+    With a hash where the flags do not all find room, or do not say all: a --config file may be edited.
+    """
+    name = "_".join(word.lstrip("-").replace("/", "-") for word in sorted(flags)) or "default"
+    files = [Path(word.partition("=")[2]) for word in flags if word.startswith("--config=")]
+    if len(name) <= MAX_NAME and not files:
+        return name
+    digest = hashlib.sha256(os.fsencode("\n".join(sorted(flags))))
+    for file in files:
+        with suppress(OSError):  # the run itself says what is wrong with it
+            digest.update(file.read_bytes() if file.is_file() else b"")
+    return f"{name[: MAX_NAME - 13]}_{digest.hexdigest()[:12]}"
 
 
 def finished(cell: Cell) -> dict[str, Any] | None:
@@ -71,20 +93,31 @@ def finished(cell: Cell) -> dict[str, Any] | None:
 
 
 def run_in_a_process(cell: Cell) -> int:
-    """Trains a cell; what it shows goes to `log.txt` beside the runs of its algorithm."""
+    """Trains a cell; what it shows goes to `log.txt` beside the runs of its algorithm, its last words to stderr."""
     cell.path.parent.mkdir(parents=True, exist_ok=True)
     with (cell.path.parent / f"{cell.path.name[:100]}.log.txt").open("a") as log:
         command = [sys.executable, "-m", "experiments.run", *cell.command]
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True)
-        while True:
-            try:
-                _, errors = process.communicate()
-                break
-            except KeyboardInterrupt:  # the run has got it too, and saves
-                continue
-    if process.returncode == BAD_USAGE:
+        stopped = False
+
+        def pass_on(number: int, _: FrameType | None) -> None:
+            nonlocal stopped
+            stopped = True
+            process.send_signal(number)
+
+        before = signal.signal(signal.SIGTERM, pass_on)
+        try:
+            while True:
+                try:
+                    _, errors = process.communicate()
+                    break
+                except KeyboardInterrupt:  # the run has got it too, and saves
+                    stopped = True
+        finally:
+            signal.signal(signal.SIGTERM, before)
+    if process.returncode not in (DONE, DIVERGED, INTERRUPTED) and errors.strip():
         print(errors.strip(), file=sys.stderr)
-    return process.returncode
+    return INTERRUPTED if stopped else process.returncode  # also where the run had just ended, or just begun
 
 
 def sweep(
@@ -101,7 +134,8 @@ def sweep(
         started = clock()
         code = train(cell)
         if code not in (DONE, DIVERGED):
-            say(f"{cell.algo} on {cell.task}: ended with exit code {code}; the same command goes on from there")
+            on = "; the same command goes on from there" if code == INTERRUPTED else ""
+            say(f"{cell.algo} on {cell.task}: ended with exit code {code}{on}")
             return code
         worst = max(worst, code)
         left = (clock() - began) / number * (len(todo) - number)
@@ -129,6 +163,8 @@ def main(argv: Sequence[str]) -> int:
     from sqt_jax import envs
     from sqt_jax.algorithms import ALGORITHMS
 
+    if FLAGS.preset is None:
+        return refuse(f"--preset: takes one of {', '.join(PRESETS)}")
     if FLAGS.preset not in PRESETS:
         return refuse(f"--preset: {unknown(str(FLAGS.preset), PRESETS)}")
     for algo in FLAGS.algos:

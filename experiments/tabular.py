@@ -8,6 +8,7 @@ Exit codes: 0 done; 2 bad usage (one line, nothing written); 130 interrupted.
 """
 
 import functools
+import io
 import math
 import re
 import shlex
@@ -26,14 +27,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from experiments import command_line
+from experiments.command_line import UsageError, printable
 from experiments.running import runtime
-from experiments.running.flags import ABSL_FLAGS, UsageError
+from experiments.running.flags import ABSL_FLAGS
 from experiments.running.progress import format_seconds
 from experiments.theorem import contraction, mdps, tabular_agents, tabular_figure
 from experiments.theorem import tabular_report as report
 from sqt_jax.names import nearest, unknown
 
 DONE, BAD_USAGE, INTERRUPTED = 0, 2, 130
+TABLE, FIGURE = "table.md", "tabular.png"
 FIRST_CHECKPOINT = 100
 CHECKPOINTS_PER_DECADE = 8
 
@@ -56,7 +60,7 @@ def define_flags() -> absl_flags.FlagValues:
     define(integer, "tables", 4, "Tables of MaxMin and SQT.", lower_bound=2, upper_bound=100)
     define(integer, "ddof", 1, "The std over tables divides by N - ddof.", lower_bound=0, upper_bound=1)
     define(absl_flags.DEFINE_string, "greedy", "min", f"Chooses SQT's a': {', '.join(tabular_agents.GREEDY)}.")
-    define(number, "gamma", 0.8, "Discount factor, below 1.", lower_bound=0.0)
+    define(number, "gamma", 0.8, "Discount factor, above 0 and below 1.", lower_bound=0.0)
     define(number, "lr_power", 0.7, "Step size 1 / n(s, a)^lr_power, above 0.5 and up to 1.", upper_bound=1.0)
     define(number, "epsilon", 1.0, "Share of random actions; 1: uniform.", lower_bound=0.0, upper_bound=1.0)
     define(number, "init_std", 0.0, "Std of the tables' initial values.", lower_bound=0.0)
@@ -106,8 +110,8 @@ def parse(argv: Sequence[str]) -> dict[str, Any]:
     for name in ("gamma", "lr_power", "epsilon", "init_std", "weighted_c"):
         if not math.isfinite(flag[name]):
             raise UsageError(f"--{name}: takes a number, not {flag[name]}")
-    if flag["gamma"] >= 1:
-        raise UsageError(f"--gamma: takes a number from 0 to below 1, not {flag['gamma']:g}")
+    if not 0 < flag["gamma"] < 1:  # the ratios of eq. 16 are divided by it
+        raise UsageError(f"--gamma: takes a number above 0 and below 1, not {flag['gamma']:g}")
     if flag["lr_power"] <= 0.5:
         raise UsageError(f"--lr_power: takes a number above 0.5 and up to 1, not {flag['lr_power']:g}")
     if flag["weighted_c"] == 0:
@@ -138,13 +142,13 @@ def _check_out(name: str, overwrite: bool) -> None:
     path = Path(name)
     if not name or "\0" in name:
         raise UsageError("--out: takes a folder")
+    command_line.refuse_folder("--out", path)
     try:
-        if path.exists() and not path.is_dir():
-            raise UsageError(f"--out={name}: takes a folder, which this is not")
         if not overwrite and path.exists() and any(path.iterdir()):
             raise UsageError(f"--out={name}: is there already; takes another folder, or --overwrite beside it")
     except OSError as error:
         raise UsageError(f"--out={name}: takes a folder that can be read: {error.strerror}") from None
+    command_line.refuse_existing(path, (TABLE, FIGURE), overwrite)
 
 
 def checkpoints(steps: int) -> np.ndarray:
@@ -241,14 +245,9 @@ def main(argv: Sequence[str]) -> int:
         return DONE
     try:
         flag = parse(argv)
-        out = Path(flag["out"])
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"--out={out}: takes a folder that can be made: {error.strerror}") from None
-        return measure(flag, out, argv)
+        return measure(flag, Path(flag["out"]), argv)
     except UsageError as error:
-        print("".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error)), file=sys.stderr)
+        print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -280,9 +279,10 @@ def measure(flag: dict[str, Any], out: Path, argv: Sequence[str]) -> int:
     print_statements(console, found)
     command = shlex.join(["python", "-m", "experiments.tabular", *argv[1:]])
     text = report.markdown(command, settings_of(flag), table, found, expansion)
-    (out / "table.md").write_text(text, encoding="utf-8")
-    tabular_figure.draw(results, out / "tabular.png")
-    console.print(f"\n{out / 'table.md'}, {out / 'tabular.png'}", soft_wrap=True, highlight=False, markup=False)
+    picture = io.BytesIO()
+    tabular_figure.draw(results, picture)
+    command_line.write_files(out, {TABLE: text.encode(), FIGURE: picture.getvalue()})
+    console.print(f"\n{out / TABLE}, {out / FIGURE}", soft_wrap=True, highlight=False, markup=False)
     return DONE
 
 

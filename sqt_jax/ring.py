@@ -83,11 +83,11 @@ class Ring(NamedTuple):
         Raises:
           ValueError: other than E transitions of these sizes.
         """
-        e, obs = self.num_envs, (self.num_envs, self.observation_size)
-        sizes = Transition(obs=obs, action=(e, self.action_size), reward=(e,), next_obs=obs, discount=(e,))
-        given = Transition(*map(jnp.shape, transition))
-        if given != sizes:
-            raise ValueError(f"takes transitions of {sizes}, not {given}")
+        e, o, a = self.num_envs, self.observation_size, self.action_size
+        wanted = {"obs": (e, o), "action": (e, a), "reward": (e,), "next_obs": (e, o), "discount": (e,)}
+        given = {name: jnp.shape(value) for name, value in transition._asdict().items()}
+        if given != wanted:
+            raise ValueError(f"takes transitions of {wanted}, not {given}")
         before = state.inserted - self.num_envs + jnp.arange(self.num_envs)  # the numbers of the rows before
         final = (before >= 0) & jnp.any(state.newest != transition.obs, axis=-1)
         order = jnp.cumsum(final, dtype=jnp.int32) - 1

@@ -148,6 +148,27 @@ def test_a_wrong_name_is_told_in_one_line_before_anything_runs(flag, value):
     assert message.startswith(f"--{flag}: takes ") and value in message and "\n" not in message
 
 
+@pytest.mark.parametrize("flag", ["tasks", "algos", "members", "devices", "capacities", "physics"])
+def test_a_list_of_nothing_is_refused_but_of_the_suites(flag, monkeypatch):
+    bench.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(suites=[]):
+        bench.check_flags()
+    with flagsaver.flagsaver(**{flag: []}), pytest.raises(SystemExit, match=f"^--{flag}: takes at least one$"):
+        bench.main(["bench"])
+
+
+def test_figures_that_cannot_be_written_are_told_before_and_after(tmp_path):
+    (tmp_path / "file").write_text("")
+    bench.FLAGS.mark_as_parsed()
+    given = {"suites": ["growth"], "members": ["5"], "figures": str(tmp_path / "file" / "below")}
+    with flagsaver.flagsaver(**given):
+        with pytest.raises(SystemExit, match="^--figures=.*/file/below: takes a folder that can be written$"):
+            bench.main(["bench"])
+        row = bench.Row("growth", "a", 5, "member updates", 10.0, point=("members", "td3", 5))
+        with pytest.raises(SystemExit, match="^--figures=.*/file/below: takes a folder that can be written: Not a dir"):
+            bench.show([row], 0.0)
+
+
 def test_physics_that_cannot_run_here_are_left_out_or_refused(run, monkeypatch, capsys):
     monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
     run(lambda suites, physics, environment, **timing: [])
@@ -165,7 +186,7 @@ def test_a_suite_by_name_sets_the_flags_that_were_not_given():
             bench.check_flags()
             assert bench.FLAGS.members == ["5", "64", "512"] and bench.FLAGS.algos == ["td3", "td7"]
             assert bench.FLAGS.profile and bench.FLAGS.suites == ["loop"] and bench.FLAGS.devices == ["1", "auto"]
-            assert bench.FLAGS.tasks == bench.PAPERS_TASKS  # as given
+            assert bench.FLAGS.tasks == list(bench.PAPERS_TASKS)  # as given
         finally:
             bench.FLAGS["tasks"].present = 0
 

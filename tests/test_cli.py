@@ -180,7 +180,8 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
     # What a diverged member returns says nothing: no row, mean or score counts it; those of the others stay.
     rows = rows_of(tmp_path / "ant" / "sac_sqt" / "run" / "evaluations.csv")
     late = [row for row in rows if row["env_steps"] != "0"]
-    assert {row["member"] for row in late if row["return_mean"]} == {"0", "1"}
+    for column in ("return_mean", "q_mean", "q_std"):
+        assert {row["member"] for row in late if row[column]} == {"0", "1"}
     assert [group["final"]["mean"] is None for group in summary["groups"]] == [False, True]
     # The others do not notice: their rows are those of a run in which nobody diverges.
     assert run(tmp_path / "good", "--temperature=0.2,0.3") == 0
@@ -236,6 +237,15 @@ def test_a_second_signal_ends_the_process_at_once(monkeypatch):
         assert codes == [130]
 
 
+def test_a_sigterm_that_comes_twice_at_once_is_one(monkeypatch):
+    """By a batch system and by `experiments.sweep`, which passes its own on."""
+    monkeypatch.setattr(experiments.run.os, "_exit", lambda code: pytest.fail("it left without saving"))
+    with experiments.run._stop_on_signal() as received:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert received == [signal.SIGTERM]
+
+
 def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
     arguments = TINY.removesuffix(" --name=run").split()
     options = ["--penalty_coef=0,0.5", "--quiet", f"--out={tmp_path}"]
@@ -255,7 +265,7 @@ def test_help_lists_every_group(capsys):
         "Algorithm",
         "Output:",
         "--algo=NAME",
-        "Exit codes: 0 done, 2 bad usage",
+        "Exit codes: 0 done, 1 the results could not be written, 2 bad usage",
     ):
         assert words in out
 
@@ -312,6 +322,18 @@ def test_physics_that_cannot_run_here_is_refused(tmp_path, capsys, monkeypatch, 
     out, err = capsys.readouterr()
     assert (out, err) == ("", f"--{flag}: warp needs a part; takes one of mjx, mujoco here\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
+    """It says that the run has ended: not before its policies and curves are there."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(experiments.run, "save_policy", full)
+    assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 1
+    assert "the results cannot be written: " in capsys.readouterr().out
+    assert not (tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):

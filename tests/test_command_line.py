@@ -12,6 +12,7 @@ def parser():
     made.add_argument("--format", type=one_of("png", "svg"), default="png", metavar="NAME")
     made.add_argument("--seed", type=whole, default=0, metavar="N")
     made.add_argument("--out", type=folder, metavar="FOLDER")
+    made.add_argument("--camera", metavar="NAME")
     made.add_argument("--overwrite", action="store_true")
     return made
 
@@ -30,7 +31,10 @@ def test_runs_and_flags_in_any_order(parser):
         (["a", "--xyz"], "--xyz: unknown flag; --help lists the flags"),
         (["a", "--form=svg"], "--form: unknown flag; did you mean --format?"),  # no abbreviations
         (["a", "--format=gif"], "--format: takes one of png, svg, not 'gif'"),
-        (["a", "--format"], "--format: takes NAME"),
+        (["a", "--format"], "--format: takes one of png, svg"),
+        (["a", "--seed", "--overwrite"], "--seed: takes a whole number of at least 0"),
+        (["a", "--out"], "--out: takes a folder"),
+        (["a", "--camera"], "--camera: takes a name"),
         (["a", "--seed=-1"], "--seed: takes a whole number of at least 0, not '-1'"),
         (["a", "--out="], "--out: takes a folder"),
         (["a", "--overwrite=yes"], "--overwrite: is a switch and takes no value"),
@@ -70,8 +74,11 @@ def test_folders_that_cannot_be_written(tmp_path):
     file.write_text("x")
     with pytest.raises(UsageError, match="takes a folder, which this is not"):
         command_line.refuse_existing(file, ["a.csv"], overwrite=True)
-    with pytest.raises(UsageError, match="takes a folder that can be written"):
-        command_line.write_files(file / "below", {"a.csv": b""})
+    for out in (file / "below", file / "below" / "further", tmp_path / ("x" * 300)):
+        with pytest.raises(UsageError, match="^--out=.*: takes a folder that can be written"):
+            command_line.refuse_existing(out, ["a.csv"], overwrite=True)
+        with pytest.raises(UsageError, match="^--out=.*: takes a folder that can be written"):
+            command_line.write_files(out, {"a.csv": b""})
     (tmp_path / "a.csv").mkdir()
     with pytest.raises(UsageError, match="a.csv is a folder"):
         command_line.refuse_existing(tmp_path, ["a.csv"], overwrite=True)

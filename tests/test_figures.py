@@ -8,6 +8,7 @@ from experiments.evidence import figures
 from experiments.evidence.collected import collect
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS
 from experiments.evidence.figures import draw_curves, over_time, penalty_sweep
+from experiments.evidence.table_parts import NOT_RESAMPLED
 from experiments.records import EVALUATION_COLUMNS
 
 NAN = float("nan")
@@ -97,6 +98,7 @@ def test_a_sweep_has_a_dot_per_seed_and_the_base_at_nothing(tmp_path):
     (line,) = [line for line in lines_of(axes, ALGORITHM_COLOURS["td3_sqt"]) if len(line) == 3]
     np.testing.assert_allclose(line, [[0, 6], [1, 2], [2, 3]])
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.25", "0.5"]
+    assert NOT_RESAMPLED in figure.get_suptitle().replace("\n", " ")
     assert legend_of(figure) == ["td3", "td3_sqt"]
 
 
@@ -129,6 +131,17 @@ def test_profile_by_hand(tmp_path):
             assert line[np.argmin(np.abs(line[:, 0] - threshold)), 1] == share
     assert legend_of(figure) == ["td3", "sac"]
     assert "left out: td7, which has no score on cheetah" in figure.get_supxlabel()
+    assert NOT_RESAMPLED in figure.get_suptitle().replace("\n", " ")
+
+
+def test_a_profile_has_a_band_only_where_all_its_tasks_have_several_seeds(tmp_path):
+    write_run(tmp_path, "td3", "cheetah", curves=[[0, 0, 4], [0, 0, 8]])
+    write_run(tmp_path, "td3", "ant", curves=[[0, 0, 4]])
+    (axes,) = panels(figures.performance_profile(collect([str(tmp_path)])))
+    assert not axes.collections
+    write_run(tmp_path / "more", "td3", "ant", curves=[[0, 0, 5]], seeds=[7])
+    (axes,) = panels(figures.performance_profile(collect([str(tmp_path)])))
+    assert len(axes.collections) == 1
 
 
 def test_a_profile_of_nothing(tmp_path):

@@ -19,6 +19,13 @@ def failing(*_):
     raise ValueError("\n  No memory [/left]\nand more of it")
 
 
+@pytest.mark.parametrize(
+    ("rate", "shown"), [(123_456.7, "123,457"), (99.96, "100"), (12.34, "12.3"), (1.5, "1.5"), (0.0456, "0.0456")]
+)
+def test_a_low_rate_is_shown_with_three_digits(rate, shown):
+    assert Row("checkpoint", "a", 5, "checkpoints", rate).figure == (shown, "checkpoints/s")
+
+
 def test_a_case_that_fails_is_told_and_the_others_are_measured(monkeypatch):
     monkeypatch.setattr(kernels, "profile", lambda run, steps: [kernels.Kind("dot", steps, 1.0)])
     cases = [Case(Row("loop", "a", 5, "env steps"), failing), case("b", failing), case("c", operations=2.0)]

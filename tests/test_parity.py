@@ -46,7 +46,7 @@ def test_the_report_has_a_row_for_every_task_and_physics(tmp_path, capsys, monke
     monkeypatch.setattr(parity.runtime, "prepare", lambda: None)
     monkeypatch.setattr(parity, "episode", lambda name, seed, scale: episode(name, seed, scale, steps=20))
     parity.FLAGS.mark_as_parsed()
-    out = tmp_path / "parity.md"
+    out = tmp_path / "new" / "parity.md"
     with flagsaver.flagsaver(
         tasks=["hopper", "walker-v5"],
         physics=["mujoco"],
@@ -75,6 +75,38 @@ def test_wrong_names_are_told_in_one_line(flag, value):
     with flagsaver.flagsaver(**{flag: [value]}), pytest.raises(SystemExit) as error:
         parity.main(["parity"])
     assert str(error.value).startswith(f"--{flag}: takes some of ") and "\n" not in str(error.value)
+
+
+OTHERS = ["suites", "suite", "algos", "members", "devices", "capacities", "profile", "figures", "compare", "json"]
+
+
+@pytest.mark.parametrize("name", [*OTHERS, "peer_python"])
+def test_flags_that_the_benchmark_alone_has_a_use_for_are_refused(name):
+    parity.FLAGS.mark_as_parsed()
+    parity.FLAGS[name].present = 1
+    try:
+        with pytest.raises(SystemExit, match=f"^--{name}: has no effect here; takes of the benchmark's flags --tasks"):
+            parity.main(["parity"])
+    finally:
+        parity.FLAGS[name].present = 0
+    for taken in parity.TAKEN:
+        parity.FLAGS[taken].present += 1
+    try:
+        parity.refuse_others()
+    finally:
+        for taken in parity.TAKEN:
+            parity.FLAGS[taken].present -= 1
+
+
+def test_a_report_that_cannot_be_written_is_refused_before_anything_runs(tmp_path):
+    parity.FLAGS.mark_as_parsed()
+    (tmp_path / "file").write_text("")
+    for out, told in {
+        tmp_path: "takes a file, which this folder",
+        tmp_path / "file" / "a.md": "takes a file in",
+    }.items():
+        with flagsaver.flagsaver(out=str(out)), pytest.raises(SystemExit, match=f"^--out={out}: {told}"):
+            parity.main(["parity"])
 
 
 def test_limits_of_mjxs_solver_are_rows_of_their_own():

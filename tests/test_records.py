@@ -9,7 +9,6 @@ from experiments import records
 from experiments.records import (
     EVALUATION_COLUMNS,
     Records,
-    RunExists,
     read_evaluations,
     summarise,
 )
@@ -74,6 +73,16 @@ def test_evaluations_have_exactly_the_agreed_columns(tmp_path):
     )
 
 
+def test_critics_of_a_member_that_diverged_are_in_no_row_of_evaluations(tmp_path):
+    with Records(tmp_path / "run", members_of(), [], tensorboard=False) as records:
+        metrics = {"q_std": [0.25, 0.5], "q_mean": [1.0, 2.0]}
+        records.report(report(10, [[2.0], [6.0]], metrics))
+        records.report(report(20, [[2.0], [np.nan]], metrics))
+    table = read_evaluations(tmp_path / "run" / "evaluations.csv")
+    for name in ("q_std", "q_mean"):
+        assert np.isnan(table[name]).tolist() == np.isnan(table["return_mean"]).tolist() == [False] * 3 + [True]
+
+
 def test_other_swept_scalars_are_further_columns(tmp_path):
     with Records(tmp_path / "run", members_of(temperature=[0.1, 0.2]), ["temperature"], tensorboard=False) as records:
         records.report(report(20, [[1.0]] * 4, {"temperature": [0.1, 0.1, 0.2, 0.2]}))
@@ -90,15 +99,6 @@ def test_an_interval_without_an_evaluation_is_a_row_of_metrics_alone(tmp_path):
         records.report(report(20, None, {"loss": [1.0, 2.0]}))
     assert len((tmp_path / "run" / "evaluations.csv").read_text().splitlines()) == 1
     assert len((tmp_path / "run" / "metrics.csv").read_text().splitlines()) == 3
-
-
-def test_a_directory_with_a_run_is_refused_and_left_alone(tmp_path):
-    with Records(tmp_path / "run", members_of(), [], tensorboard=False):
-        pass
-    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    with pytest.raises(RunExists):
-        Records(tmp_path / "run", members_of(), [], tensorboard=False)
-    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
 
 def test_summary_by_hand(tmp_path):
@@ -140,7 +140,7 @@ def test_summary_by_hand(tmp_path):
             {"member": 2, "seed": 3, "penalty_coef": 0.5, "final_return": 1.0, "best_return": 2.0}
             | {"best_env_steps": 10, "q_std": 0.3},
             {"member": 3, "seed": 5, "penalty_coef": 0.5, "final_return": None, "best_return": 0.0}
-            | {"best_env_steps": 0, "q_std": 0.4},
+            | {"best_env_steps": 0, "q_std": None},
         ],
     }
     assert summary["status"] == "diverged"

@@ -6,17 +6,22 @@ import os
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import probe_envs
 import pytest
+from made_runs import write_run
 from test_cli import rows_of, run
 
 import experiments.run
 from experiments import checkpoints, records
+from experiments.command_line import UsageError
 from experiments.killtest import differences, result_of
 from experiments.run import main
 from experiments.running import described, loop
+from experiments.running.resume import named
+from sqt_jax.envs import physics
 
 MEMBERS = ("--penalty_coef=0,0.5", "--checkpoint_every=20")
 
@@ -107,10 +112,10 @@ def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_pat
 def test_a_finished_run_stays_as_it_is(tmp_path, whole):
     assert run(tmp_path, *MEMBERS) == 0
     tables = [path_in(tmp_path) / name for name in ("evaluations.csv", "metrics.csv")]
+    tables += [path_in(tmp_path) / name for name in ("summary.json", "config.json", "curves.png")]
     before = [table.read_bytes() for table in tables]
     assert resume(tmp_path) == 0
     assert [table.read_bytes() for table in tables] == before
-    assert json.loads((path_in(tmp_path) / "summary.json").read_text())["status"] == "done"
 
 
 def test_a_finished_run_is_gone_on_with_for_more_steps(tmp_path):
@@ -150,6 +155,36 @@ def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
     assert resume(tmp_path, "--checkpoint_every=20") == 2
     assert "takes a run with checkpoints to go on from; it has none" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(("reached", "refused"), [(0, False), (50, False), (100, False), (150, True)])
+def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, refused):
+    """Evaluations every 50 steps, checkpoints every 50: of step 100 the row is there before the second checkpoint."""
+    path = write_run(tmp_path, curves=[range(reached // 50 + 1)])
+    if not refused:
+        experiments.run._refuse_to_begin_again(path, 50)
+        return
+    with pytest.raises(UsageError) as error:
+        experiments.run._refuse_to_begin_again(path, 50)
+    assert str(error.value) == (
+        f"--resume={path}: takes a run with checkpoints to go on from; it has none, and its evaluations reach step "
+        "150; --overwrite or another --name begins anew"
+    )
+
+
+def test_tables_of_a_resumed_run_that_cannot_be_written_are_named_by_its_flag(tmp_path, monkeypatch):
+    def fails(*_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(records, "Records", fails)
+    options = SimpleNamespace(out="runs")
+    plan = SimpleNamespace(path=tmp_path, resumed=True, options=options, members=[], swept=[])
+    plan.output = {"tensorboard": True}
+    with pytest.raises(UsageError, match=f"^--resume={tmp_path}: takes a folder that can be written: .*Read-only"):
+        experiments.run._tables(plan, None, print)
+    plan.resumed = None
+    with pytest.raises(UsageError, match="^--out=runs: takes a folder that can be written: .*Read-only"):
+        experiments.run._tables(plan, None, print)
 
 
 @pytest.mark.parametrize("where", ["described.write", "Records", "train_loop"])
@@ -216,6 +251,20 @@ def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatc
     assert resume(tmp_path, "--steps=140", "--keep_checkpoints=3") == 0
     assert seen == [False]
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
+
+
+def test_a_run_is_evaluated_on_the_physics_that_it_began_with(tmp_path, monkeypatch):
+    """Whatever --eval_physics=auto would choose on this machine, which is mujoco on a CPU."""
+    path = write_run(tmp_path, physics="mujoco", versions=described.versions())
+    content = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps(content | {"evaluated_on": "mjx"}))
+    for wanted in ({}, {"eval_physics": "auto"}):  # its own setting is still what it was
+        run = named(path, wanted)
+        assert {member.config.eval_physics for member in run.members} == {"mjx"}
+        assert run.content["settings"]["eval_physics"] == "auto"
+    monkeypatch.setitem(physics.LACKS, "mjx", lambda: "a part")
+    with pytest.raises(UsageError, match="^--eval_physics: mjx needs a part"):
+        named(path, {})
 
 
 @pytest.mark.slow

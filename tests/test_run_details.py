@@ -73,7 +73,7 @@ def test_a_run_that_was_gone_on_with_has_all_its_commands(tmp_path):
     resumed = [
         {"env_steps": 1000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.10.2"}},
         {"env_steps": 2000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.11", "brax": "1"}},
-        {"env_steps": -1, "command": ["run.py", "--config=f.yaml"]},
+        {"env_steps": 0, "command": ["run.py", "--config=f.yaml"]},
         "nonsense",
     ]
     first, second, other, third, fourth = details(write_run(tmp_path), resumed=resumed).commands
@@ -109,6 +109,19 @@ def test_how_it_ended(tmp_path, summary, status, took):
         (path / "summary.json").write_text(summary)
     found = details(path)
     assert (found.status, found.facts.get("took")) == (status, took)
+
+
+def test_training_and_speed_are_the_last_processs_where_there_were_several(tmp_path):
+    path = write_run(tmp_path)
+    (path / "summary.json").write_text(
+        '{"status": "done", "wall_seconds": 90, "train_seconds": 20, "steps_per_second": 500}'
+    )
+    names = {"of that training": "20.0 s", "speed": "500 training steps/s", "took": "90.0 s"}
+    assert names.items() <= details(path).facts.items()
+    facts = details(path, resumed=[{"env_steps": 50}]).facts
+    names = {"training of the last process": "20.0 s", "speed of the last process": "500 training steps/s"}
+    assert (names | {"took": "90.0 s"}).items() <= facts.items()
+    assert not {"of that training", "speed"} & facts.keys()
 
 
 def test_no_run_is_refused(tmp_path):

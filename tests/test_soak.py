@@ -4,6 +4,7 @@ import re
 
 import jax.numpy as jnp
 import pytest
+from absl import flags
 from absl.testing import flagsaver
 
 from experiments import soak
@@ -17,6 +18,11 @@ def short(monkeypatch):
     soak.FLAGS.mark_as_parsed()
     with flagsaver.flagsaver(steps=200, envs=3, rounds=2):
         yield
+
+
+def test_a_single_round_which_has_no_memory_to_compare_with_is_refused(short):
+    with pytest.raises(flags.IllegalFlagValueError, match="rounds"):
+        soak.FLAGS.rounds = 1
 
 
 def test_every_task_has_its_turns(short, capsys):

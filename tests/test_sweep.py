@@ -1,8 +1,12 @@
 """The grids of runs: what is trained, what is left alone, what is gone on with."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import probe_envs
@@ -10,7 +14,7 @@ import pytest
 
 from experiments import run
 from experiments.running import loop
-from experiments.sweep import PRESETS, Preset, cells, finished, sweep
+from experiments.sweep import PRESETS, Preset, cells, finished, name_of, run_in_a_process, sweep
 from sqt_jax.algorithms import ALGORITHMS
 
 TINY = "--seeds=0,1 --steps=60 --warmup_steps=30 --eval_every=30 --eval_episodes=1 --batch_size=8 --hidden=8 --quiet"
@@ -34,6 +38,64 @@ def test_tables_2_to_4_are_the_papers_nine_on_its_four_tasks():
 
     assert of("table2") == of("table3") and of("table2") | of("table4") == of("all")
     assert len({algo for algo, _ in of("all")}) == 9 and len(of("all")) == 36
+
+
+def test_an_ordinary_cell_is_called_by_its_flags():
+    assert name_of(["--steps=10", "--hidden=8,8", "--out=a/b"]) == "hidden=8,8_out=a-b_steps=10"
+    assert name_of([]) == "default"
+
+
+def test_names_that_are_cut_tell_cells_apart():
+    common = [f"--seeds={','.join(map(str, range(100)))}"]
+    one, other = (name_of([*common, f"--steps={steps}"]) for steps in (100, 200))
+    assert one != other == name_of([*common, "--steps=200"]) and len(one) == len(other) == 200
+
+
+def test_a_file_of_settings_that_was_edited_is_another_cell(tmp_path):
+    file = tmp_path / "grid.yaml"
+    names = []
+    for content in ("steps: 10", "steps: 20", "steps: 10"):
+        file.write_text(content)
+        names.append(name_of([f"--config={file}"]))
+    assert names[0] == names[2] != names[1]
+    assert name_of(["--config=none.yaml"]).startswith("config=none.yaml_")
+
+
+@pytest.fixture
+def child(tmp_path, monkeypatch):
+    """A cell whose process is a shell script instead of a training."""
+
+    def make(script):
+        python = tmp_path / "python"
+        python.write_text(f"#!/bin/sh\n{script}\n")
+        python.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(python))
+        return cells(GRID, (), (), tmp_path / "out", ())[0]
+
+    return make
+
+
+@pytest.mark.parametrize(("code", "told"), [(1, True), (2, True), (134, True), (0, False), (3, False), (130, False)])
+def test_the_last_words_of_a_run_that_failed_are_told(child, capfd, code, told):
+    assert run_in_a_process(child(f"echo out; echo why >&2; exit {code}")) == code
+    assert capfd.readouterr() == ("", "why\n" if told else "")
+
+
+@pytest.mark.parametrize("trap", ["trap 'exit 130' TERM", "trap 'exit 0' TERM", ""], ids=["saved", "ended", "killed"])
+def test_a_sigterm_is_passed_on(child, tmp_path, trap):
+    before = signal.getsignal(signal.SIGTERM)
+    began = tmp_path / "began"
+
+    def terminate():
+        while not began.exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = threading.Thread(target=terminate, daemon=True)
+    thread.start()
+    assert run_in_a_process(child(f"{trap}\ntouch {began}\nwhile :; do sleep 0.05; done")) == 130
+    thread.join()
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_grid_is_trained_once(tmp_path):
@@ -76,6 +138,7 @@ def test_a_cell_that_cannot_be_trained_ends_the_sweep(tmp_path):
     grid = cells(GRID, (), (), tmp_path, ["--steps=-1"])
     assert sweep(grid, train, lines.append) == 2
     assert len(lines) == 2 and not any(tmp_path.iterdir())
+    assert lines[-1] == "td3 on ant: ended with exit code 2"  # the same command would end so again
 
 
 def test_a_diverged_member_does_not(tmp_path):
@@ -89,7 +152,7 @@ def test_a_diverged_member_does_not(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("", "--preset: takes one of table2, table3, table4, all, alpha, not 'None'"),
+        ("", "--preset: takes one of table2, table3, table4, all, alpha\n"),
         ("--preset=table2 --algos=td4", "--algos: takes one of td3, "),
         ("--preset=table2 --tasks=antt", "--tasks: takes one of cheetah, "),
         (

@@ -4,6 +4,7 @@ from table_reader import cells
 
 from experiments.evidence.collected import collect
 from experiments.evidence.table_comparisons import versus_base
+from experiments.evidence.table_parts import NOT_RESAMPLED
 
 
 def test_improvement_by_hand(tmp_path):
@@ -42,11 +43,26 @@ def test_a_percentage_without_an_interval_says_why(tmp_path):
     assert table.notes == ["no interval of the percentage: the other mean is not positive in some resamples"]
 
 
+def test_a_side_with_one_seed_has_no_interval(tmp_path):
+    write_run(tmp_path, "td3", curves=[[0, 0, 10]])
+    write_run(tmp_path, "td3_sqt", curves=[[0, 0, 12], [0, 0, 18]])
+    table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
+    assert cells(table) == [["td3_sqt against td3", "+50.0 %|P 1.00"]]
+
+
 def test_a_comparison_says_which_of_the_two_is_incomplete(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 1]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 2, 3]])
     table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
     assert table.notes == ["td3 on cheetah: seed 0 stopped at step 50 of 100"]
+
+
+def test_intervals_of_scores_and_no_others_are_said_to_leave_the_choice_out(tmp_path):
+    for algo in ("td3", "td3_sqt"):
+        write_run(tmp_path, algo)
+    runs = collect([str(tmp_path)])
+    assert NOT_RESAMPLED in versus_base(runs, False, "table2_improvement").caption
+    assert NOT_RESAMPLED not in versus_base(runs, False, "table3_change").caption
 
 
 def test_the_papers_mean_improvements_are_shown_where_the_algorithm_is(tmp_path):

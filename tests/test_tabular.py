@@ -38,7 +38,8 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
         ("--steps=1", "--steps: takes an integer in the range [100, 100000000]"),
         ("--tables=1", "--tables: takes an integer in the range [2, 100]"),
         ("--greedy=max", "--greedy: takes one of min, mean, penalised, not 'max'"),
-        ("--gamma=1", "--gamma: takes a number from 0 to below 1, not 1"),
+        ("--gamma=1", "--gamma: takes a number above 0 and below 1, not 1"),
+        ("--gamma=0", "--gamma: takes a number above 0 and below 1, not 0"),
         ("--gamma=nan", "--gamma: takes a number"),
         ("--lr_power=0.5", "--lr_power: takes a number above 0.5 and up to 1, not 0.5"),
         ("--epsilon=2", "--epsilon: takes a number in the range [0.0, 1.0]"),
@@ -46,6 +47,8 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
         ("--overwrite=3", "--overwrite: takes true or false"),
         ("--out=", "--out: takes a folder"),
         (f"--out={__file__}", f"--out={__file__}: takes a folder, which this is not"),
+        (f"--out={__file__}/below", f"--out={__file__}/below: takes a folder that can be written"),
+        ("--out=" + "x" * 300, f"--out={'x' * 300}: takes a folder that can be written"),
         ("--stepz=5", "--stepz: unknown flag; did you mean --steps?"),
         ("--flagfile=x", "--flagfile: unknown flag"),
         ("5", "5: unexpected argument"),
@@ -57,6 +60,12 @@ def test_a_wrong_flag_is_told_in_one_line_before_anything_runs(argument, message
     told = capsys.readouterr()
     assert told.err.startswith(message) and told.err.count("\n") == 1 and not told.out
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_the_place_of_a_result_is_refused_before_anything_runs(tmp_path, capsys):
+    (tmp_path / "tabular.png").mkdir()
+    assert tabular.main(["tabular", f"--out={tmp_path}", "--overwrite"]) == 2
+    assert capsys.readouterr().err.startswith(f"--out={tmp_path}: tabular.png is a folder; takes a folder without it")
 
 
 def test_help_names_every_flag(capsys):

@@ -1,5 +1,7 @@
 """The statements follow from the numbers they are given."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from made_curves import curves
@@ -55,6 +57,12 @@ def test_eq_16_is_contradicted_by_a_penalty_only():
         assert statement.verdict == verdict
         assert f"{found[0].given:.4f}" in statement.evidence
         assert ("|T Q - T Q'| = 3/2 gamma" in statement.evidence) == (coef == 0.5)
+
+
+def test_the_committed_table_has_todays_legend():
+    table = Path(report.__file__).parent.parent / "results" / "tabular" / "table.md"
+    assert "\n".join(report.LEGEND) in table.read_text(encoding="utf-8")
+    assert "there are many intervals is not corrected for" in table.read_text(encoding="utf-8")
 
 
 def test_rows_that_are_all_alike_are_one():

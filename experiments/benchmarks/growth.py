@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
+from experiments import files
 from experiments.benchmarks.measure import REPLAYS, Case, Failure, Row, in_turns, replay_case, updates
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
 from sqt_jax.members import usable_devices
@@ -87,4 +88,5 @@ def _draw(points: dict[str, dict[int, float]], x_label: str, y_label: str, path:
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
     axes.legend()
-    figure.savefig(path, dpi=150)
+    with files.whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=150)

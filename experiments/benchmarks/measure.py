@@ -54,7 +54,8 @@ class Row:
     @property
     def figure(self) -> tuple[str, str]:
         """The rate and its unit as they are shown; memory is no rate."""
-        return f"{self.rate:,.0f}", self.unit if self.unit == MEGABYTES else f"{self.unit}/s"
+        rate = f"{self.rate:,.0f}" if self.rate >= 100 else f"{self.rate:.3g}"
+        return rate, self.unit if self.unit == MEGABYTES else f"{self.unit}/s"
 
 
 class Failure(NamedTuple):

@@ -26,6 +26,7 @@ from experiments.evidence.figure_style import (
     styles,
     wrapped,
 )
+from experiments.evidence.table_parts import NOT_RESAMPLED
 
 BAND_RESAMPLES = 1000
 STATISTICS = {"iqm": statistics.iqm, "mean": statistics.mean}
@@ -158,6 +159,7 @@ def penalty_sweep(collected: Collected, statistic: str) -> Figure | None:
     handles = [handle(style[row.label], stars.starred(row.label), "o") for row in rows if row.algo in algos]
     figure.legend(handles=handles, frameon=False, fontsize="small", loc="outside right center", handlelength=3)
     heading = f"Score against penalty_coef: {NAMES[statistic]} and its 95 % bootstrap interval, dots: seeds"
+    heading += f"; {NOT_RESAMPLED}"
     figure.suptitle(wrapped(figure, heading), fontsize="medium")
     width = int(figure.get_figwidth() * 13)
     figure.supxlabel("\n".join(["penalty_coef", *stars.lines(width)]), fontsize="small")
@@ -202,7 +204,7 @@ def performance_profile(collected: Collected) -> Figure | None:
             look = style[row.label]
             kind = {"color": look.colour, "linestyle": look.line, "marker": look.marker}
             axes.plot(thresholds, statistics.mean(*above), linewidth=1.8, markevery=25, markersize=4, **kind)
-            if any(len(values) > 1 for values in normalised[row.label]):
+            if all(len(values) > 1 for values in normalised[row.label]):
                 band = statistics.bootstrap(statistics.mean, *above, resamples=BAND_RESAMPLES)
                 axes.fill_between(
                     thresholds, *band, color=look.colour, alpha=0.13 if len(panel.rows) < 5 else 0.05, linewidth=0
@@ -211,7 +213,7 @@ def performance_profile(collected: Collected) -> Figure | None:
                 stars.add(row.label, f"{row.label} on {task}", row.groups[task].notes)
         dress(axes, steps=False)
         axes.set_ylim(-0.02, 1.02)
-    heading = f"Performance profile over {', '.join(best)}; band: 95 % stratified bootstrap"
+    heading = f"Performance profile over {', '.join(best)}; band: 95 % stratified bootstrap; {NOT_RESAMPLED}"
     below = "τ: score as a fraction of the best algorithm's mean on the task"
     finish(figure, panels, style, stars, heading, below, "share of seeds above τ")
     return figure

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 FOLDER = Path(__file__).parent / "data" / "reference"
+PAPERS_TASKS = ("cheetah", "walker", "ant", "humanoid")
 PAPER = "SQT paper, text"
 RELEASED = "the authors' released curves of an earlier version (2023)"
 

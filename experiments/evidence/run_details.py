@@ -80,7 +80,7 @@ def read(path: Path, curves: Sequence[Curves]) -> Details:
     except described.NotDescribed as error:
         raise UsageError(f"{path}: {error}") from None
     config, content = run.members[0].config, run.content
-    status, end = _end(path)
+    status, end = _end(path, bool(content["resumed"]))
     return Details(
         path,
         config.algo,
@@ -98,8 +98,8 @@ def read(path: Path, curves: Sequence[Curves]) -> Details:
     )
 
 
-def _end(path: Path) -> tuple[str, dict[str, str]]:
-    """How it ended, and what summary.json says besides."""
+def _end(path: Path, resumed: bool) -> tuple[str, dict[str, str]]:
+    """How it ended, and what summary.json says besides: of all processes the time that it took, else of the last."""
     try:
         summary = files.read_json(path / "summary.json", MAX_SUMMARY_BYTES)
         status = summary["status"]
@@ -112,8 +112,8 @@ def _end(path: Path) -> tuple[str, dict[str, str]]:
     found = {}
     for key, name, unit in (
         ("wall_seconds", "took", "s"),
-        ("train_seconds", "of that training", "s"),
-        ("steps_per_second", "speed", "training steps/s"),
+        ("train_seconds", "training of the last process" if resumed else "of that training", "s"),
+        ("steps_per_second", "speed of the last process" if resumed else "speed", "training steps/s"),
     ):
         value = summary.get(key)
         if isinstance(value, int | float) and not isinstance(value, bool):
@@ -152,7 +152,7 @@ def _commands(content: Mapping[str, Any]) -> list[Command]:
     for entry in content["resumed"]:
         entry = entry if isinstance(entry, dict) else {}
         at = entry.get("env_steps")
-        where = f" at step {at:,}" if type(at) is int and at >= 0 else " from the start" if at == -1 else ""
+        where = "" if type(at) is not int or at < 0 else f" at step {at:,}" if at else " from the start"
         command = _command(entry, f"and was gone on with{where} by")
         own = entry.get("versions")
         other = {n: v for n, v in own.items() if v != versions.get(n)} if isinstance(own, dict) else {}

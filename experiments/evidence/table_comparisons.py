@@ -8,7 +8,18 @@ import numpy as np
 from experiments import statistics
 from experiments.evidence import published
 from experiments.evidence.collected import PENALTY, Collected, Group, Row, base_algorithm, differing
-from experiments.evidence.table_parts import NOTHING, Cell, Line, Notes, Table, finite, interval, joined, number
+from experiments.evidence.table_parts import (
+    NOT_RESAMPLED,
+    NOTHING,
+    Cell,
+    Line,
+    Notes,
+    Table,
+    finite,
+    interval,
+    joined,
+    number,
+)
 
 
 class Comparison(NamedTuple):
@@ -62,7 +73,8 @@ def versus_base(collected: Collected, reference: bool, name: str) -> Table:
         header, lines = header[:-2], [Line(line.cells[:-2]) for line in lines]
     else:
         caption += " The last columns: the means of these over the tasks compared."
-    caption += " In brackets: 95 % intervals by stratified bootstrap, tasks and algorithms being the strata."
+    caption += " In brackets: 95 % intervals by stratified bootstrap, tasks and algorithms being the strata"
+    caption += f"; {NOT_RESAMPLED}." if score else "."
     return Table(name, title, header, [lines] if lines else [], caption, notes.texts, records)
 
 
@@ -146,7 +158,8 @@ def _against(*strata: np.ndarray) -> dict[str, float | None]:
     found: dict[str, float | None] = {}
     for name, function in statistic.items():
         key = "improvement_percent" if name == "improvement" else "probability_of_improvement"
-        single = all(len(stratum) == 1 for stratum in strata)
+        # A seed that is alone is drawn again and again: the interval would leave that side's spread out.
+        single = any(len(stratum) == 1 for stratum in strata)
         low, high = (None, None) if single else statistics.bootstrap(function, *strata)
         found |= {key: finite(function(*strata)), f"{name}_low": finite(low), f"{name}_high": finite(high)}
     return found

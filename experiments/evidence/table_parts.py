@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 NOTHING = "-"
+# Of every interval of a score: the maximum over evaluations is optimistic, and the interval does not show it.
+NOT_RESAMPLED = "that the score's evaluation was chosen is not resampled"
 
 
 class Cell(NamedTuple):

@@ -21,12 +21,22 @@ from experiments.evidence.collected import (
     row_differences,
     setting_text,
 )
-from experiments.evidence.published import Published
+from experiments.evidence.published import PAPERS_TASKS, Published
 from experiments.evidence.table_comparisons import forms_compared, has_penalty, versus_base
-from experiments.evidence.table_parts import NOTHING, Cell, Line, Notes, Table, finite, interval, joined, number
+from experiments.evidence.table_parts import (
+    NOT_RESAMPLED,
+    NOTHING,
+    Cell,
+    Line,
+    Notes,
+    Table,
+    finite,
+    interval,
+    joined,
+    number,
+)
 
 NAMES = ("table1", "table2", "table2_improvement", "table3", "table3_change", "table4", "seeds")
-PAPERS_TASKS = ("cheetah", "walker", "ant", "humanoid")
 
 
 def spread(values: np.ndarray) -> dict[str, float | None]:
@@ -83,8 +93,7 @@ def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> Table:
 def table_2(collected: Collected, reference: bool) -> Table:
     caption = (
         "Score: the best evaluation of the mean over seeds, ± the population std over seeds there (number of seeds). "
-        "Below: the IQM of the seeds at that evaluation and its 95 % bootstrap interval; that this evaluation was "
-        "chosen is not resampled."
+        f"Below: the IQM of the seeds at that evaluation and its 95 % bootstrap interval; {NOT_RESAMPLED}."
     )
     figures = published.scores() if reference else []
     table = ("table2", "Table 2: maximum average return", caption)
@@ -109,7 +118,8 @@ def table_4(collected: Collected, reference: bool) -> Table:
     rows = [row for row in both if base_algorithm(row.algo) in families]
     caption = (
         "Scores as in table 2. Comparisons: by how many per cent the first one's score exceeds the second one's, and "
-        "P, the probability that a seed of the first one exceeds one of the second, with 95 % bootstrap intervals."
+        "P, the probability that a seed of the first one exceeds one of the second, with 95 % bootstrap intervals; "
+        f"{NOT_RESAMPLED}."
     )
     figures = published.scores() if reference else []
     keep = {row.algo for row in rows}

@@ -14,6 +14,7 @@ import jax
 
 from experiments import files
 from experiments.running.flags import MAX_MEMBERS
+from sqt_jax import envs
 from sqt_jax.algorithms import eval_physics_of, make_config
 from sqt_jax.config import Config, ConfigError
 from sqt_jax.types import Scalars
@@ -103,6 +104,8 @@ def read(path: Path) -> Described:
         train, rows = members[0].config.train, content["replay_rows"]
         if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
             raise NotDescribed(f"its {NAME} names a replay that cannot be (replay_rows)")
+        if content.get("evaluated_on") not in (None, *envs.simulators(members[0].config.env)):
+            raise NotDescribed(f"its {NAME} names a physics that cannot be (evaluated_on)")
     except OSError as error:
         raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None
     except ConfigError as error:

@@ -219,8 +219,8 @@ def help_text() -> str:
     lines += [
         "",
         "In brackets: the default. A switch is turned off by --noNAME. A setting with a list is swept: the members of",
-        "the run are all its values times the seeds. Exit codes: 0 done, 2 bad usage, 3 a member diverged,",
-        "130 interrupted.",
+        "the run are all its values times the seeds.",
+        "Exit codes: 0 done, 1 the results could not be written, 2 bad usage, 3 a member diverged, 130 interrupted.",
     ]
     return "\n".join(lines)
 

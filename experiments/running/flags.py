@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from absl import flags as absl_flags
 
+from experiments.command_line import UsageError
 from experiments.presets import PRESETS
 from experiments.running import config_file
 from experiments.running.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag
@@ -48,10 +49,6 @@ class Options(NamedTuple):
     devices: int | None
     tensorboard: bool | None
     quiet: bool
-
-
-class UsageError(ValueError):
-    """A command line that cannot be. The text is one line that names the flag."""
 
 
 class _Parser(absl_flags.ArgumentParser):

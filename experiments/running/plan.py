@@ -10,6 +10,7 @@ import jax
 import psutil
 
 from experiments import records
+from experiments.command_line import UsageError
 from experiments.presets import preset_settings
 from experiments.running import described, flag_table, flags, resume, runtime
 from experiments.running.described import Described, Member
@@ -46,7 +47,7 @@ class Plan(NamedTuple):
 def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     """What a command line asks for; `env` takes the place of the environment that it names.
 
-    Raises `flags.UsageError` for settings that cannot be, a directory that is taken and too little memory.
+    Raises `UsageError` for settings that cannot be, a directory that is taken and too little memory.
     """
     members, swept, path, run = _named(options) if options.resume in (None, flags.LATEST) else _resumed(options)
     if run is None:
@@ -54,22 +55,22 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
             if options.overwrite:
                 records.run_alone(path)
             elif records.is_taken(path):
-                raise flags.UsageError(taken(path))
+                raise UsageError(taken(path))
         except records.NotARun:
-            raise flags.UsageError(not_a_run(path)) from None
+            raise UsageError(not_a_run(path)) from None
         except OSError as error:
-            raise flags.UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
+            raise UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
     config = members[0].config
     own_env = env
     try:
         env = own_env or envs.make(config.env, config.physics)
     except ValueError as error:
-        raise flags.UsageError(f"--physics: {error}") from None
+        raise UsageError(f"--physics: {error}") from None
     output = _output(options, run, config.train)
     layout = _layout(len(members), output["devices"], typed=options.devices is not None)
     needed, free = memory_estimate(config, layout.held, env), _free_memory(len(layout.devices))
     if needed > free:
-        raise flags.UsageError(
+        raise UsageError(
             f"--replay_capacity={config.train.replay_capacity}: {len(members)} members need about "
             f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; takes a smaller number, or fewer --seeds"
         )
@@ -92,7 +93,7 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
         check_physics(configs[0])
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
-        raise flags.UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
+        raise UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
     members, swept = described.make_members(options.seeds, configs), list(options.sweep)
     folder = Path(options.out) / default.env / default.algo
     path = folder / (options.name or _default_name(options))
@@ -119,7 +120,7 @@ def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Des
         try:
             wanted["env"] = envs.resolve(options.env)
         except ValueError as error:
-            raise flags.UsageError(f"--env: {error}") from None
+            raise UsageError(f"--env: {error}") from None
     run = resume.named(path, wanted, options.devices)
     return resume.with_its_replay(run), run.swept, path, run
 
@@ -135,7 +136,7 @@ def _output(options: flags.Options, run: Described | None, train: TrainConfig) -
     if options.checkpoint_every is None:  # the default may not be a multiple
         output["checkpoint_every"] -= output["checkpoint_every"] % train.num_envs
     elif options.checkpoint_every % train.num_envs:
-        raise flags.UsageError(
+        raise UsageError(
             f"--checkpoint_every: takes a multiple of num_envs ({train.num_envs}), not {options.checkpoint_every}"
         )
     return output
@@ -147,9 +148,9 @@ def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
     count = devices or usable_devices(num_members)
     if count > len(here):
         whose = "" if typed else ", and the run was started with more"
-        raise flags.UsageError(f"--devices={count}: takes at most {len(here)} here{whose}")
+        raise UsageError(f"--devices={count}: takes at most {len(here)} here{whose}")
     if count > num_members:
-        raise flags.UsageError(f"--devices={count}: takes at most one for each of {num_members} members")
+        raise UsageError(f"--devices={count}: takes at most one for each of {num_members} members")
     return Layout(num_members, tuple(here[:count]))
 
 

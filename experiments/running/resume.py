@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments import records
+from experiments.command_line import UsageError
 from experiments.running import described, runtime
 from experiments.running.described import Described, Member
-from experiments.running.flags import UsageError
 from sqt_jax.algorithms import check_physics
 from sqt_jax.config import ConfigError, check_train
 
@@ -37,7 +37,7 @@ def named(path: Path, wanted: Mapping[str, Any], devices: int | None = None) -> 
     if refusal:
         raise UsageError(f"--resume={path}: {refusal}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
-    members = [_with_train(member, steps=steps) for member in run.members]
+    members = [_with_train(_evaluated_on(member, run), steps=steps) for member in run.members]
     runtime.divide_processor(devices or len(members))  # what follows starts JAX
     try:
         check_train(members[0].config.train)
@@ -96,6 +96,12 @@ def _refusal(run: Described, wanted: Mapping[str, Any]) -> str | None:
     if there.split(".")[:2] != here.split(".")[:2]:
         return f"takes a run of sqt_jax {'.'.join(here.split('.')[:2])}, not {there[:20]}"
     return None
+
+
+def _evaluated_on(member: Member, run: Described) -> Member:
+    """The member, evaluated on what its run began with: what `auto` chose may be another physics on this machine."""
+    physics = run.content.get("evaluated_on") or member.config.eval_physics
+    return member._replace(config=dataclasses.replace(member.config, eval_physics=physics))
 
 
 def _with_train(member: Member, **changes: Any) -> Member:

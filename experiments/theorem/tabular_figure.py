@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,8 +34,8 @@ def _shade(colour: str, share: float) -> tuple[float, float, float]:
     return tuple(c * (1 - 0.8 * (share - 0.5)) for c in (red, green, blue))  # type: ignore[return-value]
 
 
-def draw(results: Mapping[Names, Curves], path: Path) -> None:
-    """A panel per MDP and quantity over the steps, means and 95 % intervals over seeds."""
+def draw(results: Mapping[Names, Curves], file: Path | BinaryIO) -> None:
+    """A PNG: a panel per MDP and quantity over the steps, means and 95 % intervals over seeds."""
     names = list(dict.fromkeys(mdp for mdp, _ in results))
     figure = Figure(figsize=(4.2 * len(names) + 0.6, 9.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
@@ -58,7 +59,7 @@ def draw(results: Mapping[Names, Curves], path: Path) -> None:
     figure.suptitle(
         f"means over {seeds} seeds, bands: 95 % intervals; Q: all tables of an algorithm", fontsize="medium"
     )
-    figure.savefig(path)
+    figure.savefig(file)
 
 
 def _label(algo: str, curves: Curves, index: int) -> str:
@@ -77,10 +78,7 @@ def _draw(axes: Axes, algo: str, curves: Curves, quantity: str) -> None:
         name = _label(algo, curves, k)
         tint = _shade(colour, k / (len(curves.coefs) - 1)) if len(shown) > 1 else colour
         mean, width = np.array([interval(values[:, k, c]) for c in range(len(curves.steps))]).T
-        low, high = mean - width, mean + width
-        if quantity != "bias":
-            low = np.maximum(low, mean / 3)  # nothing below 0 on a logarithmic axis
-        axes.fill_between(curves.steps, low, high, color=tint, alpha=0.15, linewidth=0)
+        axes.fill_between(curves.steps, mean - width, mean + width, color=tint, alpha=0.15, linewidth=0)
         axes.plot(curves.steps, mean, line, color=tint, linewidth=1.6, label=name)
 
 
@@ -90,6 +88,9 @@ def _dress(axes: Axes, quantity: str) -> None:
         axes.axhline(0, color="0.3", linewidth=0.8)
     elif axes.lines:
         axes.set_yscale("log")
+        # A band may reach 0 or below it, which this axis does not have: the lines say where it ends.
+        heights = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
+        axes.set_ylim(bottom=heights[heights > 0].min() / 1.5)
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes.yaxis.set_minor_formatter(NullFormatter())

@@ -113,6 +113,8 @@ LEGEND = (
     "all tables and pairs. Bias: mean of Q_i - Q*; on the way: its mean over the checkpoints. Std: over tables, mean",
     "over pairs; the penalty is coef times that. Ratio: max |T Q - Q*| / (gamma max |Q_i - Q*|), T the expected",
     "target; the largest over seeds and checkpoints. Eq. 16 wants at most 1.",
+    "A statement of a sign is contradicted where the interval of one row lies wholly on the other side of 0; that",
+    "there are many intervals is not corrected for.",
 )
 
 
@@ -269,7 +271,7 @@ def non_expansion(found: Sequence[Expansion], num_tables: int, gamma: float, ddo
             f"In exact arithmetic: one state, one action, three tables, ddof 1, coef {coef}. Q = {one} has min 0 and "
             f"std 0, Q' = {other} min -1 and std 1. max |Q - Q'| = {apart}, |T Q - T Q'| = {change} gamma."
         )
-        limit = (1 / gamma - 1) / (contraction.bound(1.0, num_tables, ddof) - 1) if gamma else math.inf
+        limit = (1 / gamma - 1) / (contraction.bound(1.0, num_tables, ddof) - 1)
         lines.append(
             f"With the next action given, T contracts by some factor below 1 for coef < {limit:.3f} (gamma {gamma:g}, "
             f"{num_tables} tables)."
