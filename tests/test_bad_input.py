@@ -261,7 +261,7 @@ CHANGED = {
     "output that is a list": (entries(output=[]), "does not describe a run"),
     "nan": (entries(device=float("nan")), "does not describe a run"),
     "infinity": (entries(device=float("inf")), "does not describe a run"),
-    "another algorithm": (settings(algo="sac", penalty_coef=0.0), "these differ: algo"),
+    "another algorithm": (settings(algo="sac", penalty="none", penalty_coef=0.0), "these differ: algo"),
     "another version": (entries(versions={"sqt_jax": "9.9.0\x1b"}), "takes a run of sqt_jax"),
     "no version": (entries(versions={}), "takes a run of sqt_jax"),
 }
