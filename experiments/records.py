@@ -100,7 +100,7 @@ class Records:
     Args:
       path: the run's folder, which is this process's own (`files.locked`).
       resumed_at: where a run is gone on with, the env steps and what `lengths` gave there: what was written later is
-        cut off, for training writes it again.
+        cut off, for training writes it again. Without it the folder is new: a table that is there is emptied.
 
     Raises:
       Shortened: the tables of a run that is resumed have lost rows.

@@ -60,11 +60,11 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
         # it is known that it can be gone on with.
         if not plan.resumed:
             _claim(plan, command)
-        tables = stack.enter_context(_tables(plan, restored, display.message))
-        if restored and _is_finished(plan, restored):
+        elif restored and _is_finished(plan, restored):
             if not plan.options.quiet:
                 console.print(f"{plan.path} is finished", soft_wrap=True, highlight=False, markup=False)
             return DIVERGED if restored.position.diverged else DONE
+        tables = stack.enter_context(_tables(plan, restored, display.message))
         if plan.resumed:
             _go_on(plan, plan.resumed, restored, command)
             store.remove_others()
@@ -75,7 +75,7 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
             curves = _results(plan, outcome)
             summary = tables.summary(outcome)  # the last file: it says that the run has ended
         except OSError as error:
-            display.message(f"the results cannot be written: {error}")
+            print(printable(f"the results cannot be written: {error}"), file=sys.stderr)
             return FAILED
 
     if not plan.options.quiet:
@@ -141,9 +141,7 @@ def _refuse_to_begin_again(path: Path, checkpoint_every: object) -> None:
     # The first checkpoint is on disk when the second one is due.
     reached = _reached(path)
     if isinstance(checkpoint_every, int) and reached > 2 * checkpoint_every:
-        raise UsageError(
-            f"{refusal}, and its evaluations reach step {reached:,}; --overwrite or another --name begins anew"
-        )
+        raise UsageError(f"{refusal}, and its evaluations reach step {reached:,}; remove the folder to begin anew")
 
 
 def _reached(path: Path) -> int:
@@ -159,7 +157,8 @@ def _reached(path: Path) -> int:
 def _is_finished(plan: "Plan", restored: "Restored") -> bool:
     """Whether nothing is left to do: its summary stays that of the process that ended it."""
     at = restored.position
-    return at.env_steps == at.evaluated == plan.train.steps and _summary(plan).exists()
+    there = _summary(plan).exists() and (plan.path / "policy").is_dir()
+    return at.env_steps == at.evaluated == plan.train.steps and there
 
 
 def _summary(plan: "Plan") -> Path:

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from experiments.running.progress import format_seconds
 from sqt_jax.names import unknown
 
 BASES = ("td3", "sac", "td7")
-DONE, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 2, 3, 130
+DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 MAX_NAME = 200
 
 
@@ -68,18 +67,11 @@ def cells(preset: Preset, algos: Sequence[str], tasks: Sequence[str], out: Path,
 
 
 def name_of(flags: Sequence[str]) -> str:
-    """A run's name, by its flags: a finished run is known by its name alone.
-
-    With a hash where the flags do not all find room, or do not say all: a --config file may be edited.
-    """
+    """A run's name, by its flags: a finished run is known by it. Where they do not all find room, with their hash."""
     name = "_".join(word.lstrip("-").replace("/", "-") for word in sorted(flags)) or "default"
-    files = [Path(word.partition("=")[2]) for word in flags if word.startswith("--config=")]
-    if len(name) <= MAX_NAME and not files:
+    if len(name) <= MAX_NAME:
         return name
     digest = hashlib.sha256(os.fsencode("\n".join(sorted(flags))))
-    for file in files:
-        with suppress(OSError):  # the run itself says what is wrong with it
-            digest.update(file.read_bytes() if file.is_file() else b"")
     return f"{name[: MAX_NAME - 13]}_{digest.hexdigest()[:12]}"
 
 
@@ -92,21 +84,30 @@ def finished(cell: Cell) -> dict[str, Any] | None:
         return None
 
 
+def to_do(cell: Cell) -> bool:
+    """Whether a cell is to be trained: not finished, or with a file of settings, which only the run itself compares."""
+    return any(word.startswith("--config=") for word in cell.command) or not finished(cell)
+
+
 def run_in_a_process(cell: Cell) -> int:
-    """Trains a cell; what it shows goes to `log.txt` beside the runs of its algorithm, its last words to stderr."""
+    """Trains a cell; what it shows goes to `log.txt` beside the runs of its algorithm, its errors to stderr."""
     cell.path.parent.mkdir(parents=True, exist_ok=True)
     with (cell.path.parent / f"{cell.path.name[:100]}.log.txt").open("a") as log:
         command = [sys.executable, "-m", "experiments.run", *cell.command]
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True)
+        process: subprocess.Popen[str] | None = None
         stopped = False
 
         def pass_on(number: int, _: FrameType | None) -> None:
             nonlocal stopped
             stopped = True
-            process.send_signal(number)
+            if process:
+                process.send_signal(number)
 
         before = signal.signal(signal.SIGTERM, pass_on)
         try:
+            process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True)
+            if stopped:  # before there was a process
+                process.terminate()
             while True:
                 try:
                     _, errors = process.communicate()
@@ -115,9 +116,12 @@ def run_in_a_process(cell: Cell) -> int:
                     stopped = True
         finally:
             signal.signal(signal.SIGTERM, before)
-    if process.returncode not in (DONE, DIVERGED, INTERRUPTED) and errors.strip():
+    code = process.returncode
+    if stopped and code not in (FAILED, BAD_USAGE):  # also where the run had just ended, or just begun
+        return INTERRUPTED
+    if code not in (DONE, DIVERGED, INTERRUPTED) and errors.strip():
         print(errors.strip(), file=sys.stderr)
-    return INTERRUPTED if stopped else process.returncode  # also where the run had just ended, or just begun
+    return code
 
 
 def sweep(
@@ -127,14 +131,14 @@ def sweep(
     clock: Callable[[], float] = time.monotonic,
 ) -> int:
     """Trains what is not finished; the exit code: of the first cell that could not be trained, or the worst."""
-    todo = [cell for cell in grid if not finished(cell)]
+    todo = [cell for cell in grid if to_do(cell)]
     say(f"{len(grid)} runs, {len(grid) - len(todo)} of them finished")
     began, worst = clock(), DONE
     for number, cell in enumerate(todo, start=1):
         started = clock()
         code = train(cell)
         if code not in (DONE, DIVERGED):
-            on = "; the same command goes on from there" if code == INTERRUPTED else ""
+            on = "" if code == BAD_USAGE else "; the same command goes on from there"
             say(f"{cell.algo} on {cell.task}: ended with exit code {code}{on}")
             return code
         worst = max(worst, code)

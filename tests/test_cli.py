@@ -332,7 +332,7 @@ def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(experiments.run, "save_policy", full)
     assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 1
-    assert "the results cannot be written: " in capsys.readouterr().out
+    assert "the results cannot be written: " in capsys.readouterr().err
     assert not (tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").exists()
 
 

@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,11 +112,17 @@ def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_pat
 
 def test_a_finished_run_stays_as_it_is(tmp_path, whole):
     assert run(tmp_path, *MEMBERS) == 0
-    tables = [path_in(tmp_path) / name for name in ("evaluations.csv", "metrics.csv")]
-    tables += [path_in(tmp_path) / name for name in ("summary.json", "config.json", "curves.png")]
-    before = [table.read_bytes() for table in tables]
+
+    def content():
+        files = (path for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock")
+        return {path: path.read_bytes() for path in files}
+
+    before = content()
     assert resume(tmp_path) == 0
-    assert [table.read_bytes() for table in tables] == before
+    assert content() == before
+    shutil.rmtree(path_in(tmp_path) / "policy")  # as after a full disk
+    assert resume(tmp_path) == 0
+    assert content().keys() >= before.keys()
 
 
 def test_a_finished_run_is_gone_on_with_for_more_steps(tmp_path):
@@ -168,7 +175,7 @@ def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached,
         experiments.run._refuse_to_begin_again(path, 50)
     assert str(error.value) == (
         f"--resume={path}: takes a run with checkpoints to go on from; it has none, and its evaluations reach step "
-        "150; --overwrite or another --name begins anew"
+        "150; remove the folder to begin anew"
     )
 
 

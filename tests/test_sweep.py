@@ -51,14 +51,16 @@ def test_names_that_are_cut_tell_cells_apart():
     assert one != other == name_of([*common, "--steps=200"]) and len(one) == len(other) == 200
 
 
-def test_a_file_of_settings_that_was_edited_is_another_cell(tmp_path):
-    file = tmp_path / "grid.yaml"
-    names = []
-    for content in ("steps: 10", "steps: 20", "steps: 10"):
+def test_with_a_file_of_settings_the_run_itself_says_whether_it_is_finished(tmp_path, capsys):
+    """The file may have been edited since."""
+    file, lines = tmp_path / "grid.yaml", []
+    rest = [*TINY.replace("--steps=60", f"--config={file}").split(), "--checkpoint_every=20"]
+    (cell, *_) = cells(GRID, (), (), tmp_path, rest)
+    for content, code in (("steps: 60", 0), ("steps: 60", 0), ("steps: 60\nlr: 0.1", 2)):
         file.write_text(content)
-        names.append(name_of([f"--config={file}"]))
-    assert names[0] == names[2] != names[1]
-    assert name_of(["--config=none.yaml"]).startswith("config=none.yaml_")
+        assert sweep([cell], train, lines.append) == code
+    assert "these differ: lr" in capsys.readouterr().err
+    assert [line for line in lines if "runs, " in line] == ["1 runs, 0 of them finished"] * 3
 
 
 @pytest.fixture

@@ -94,6 +94,9 @@ def read_run(path: Path) -> list[Curves]:
         settings["replay_capacity"] = rows if rows < settings["steps"] else "all"
         if evaluated_on is not None:
             settings["eval_physics"] = evaluated_on
+        # Of a member that had diverged by then; runs of an earlier version wrote its frozen critics' values.
+        gone = np.isnan(own["return_mean"])
+        own |= {name: np.where(gone, np.nan, own[name]) for name in ("q_mean", "q_std", "value_bias") if name in own}
         found.append(Curves(path, member.seed, settings, versions, own))
     if not set(columns["member"]) <= set(range(len(run.members))):
         raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that its config.json has not")

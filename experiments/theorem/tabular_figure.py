@@ -90,7 +90,9 @@ def _dress(axes: Axes, quantity: str) -> None:
         axes.set_yscale("log")
         # A band may reach 0 or below it, which this axis does not have: the lines say where it ends.
         heights = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
-        axes.set_ylim(bottom=heights[heights > 0].min() / 1.5)
+        heights = heights[np.isfinite(heights) & (heights > 0)]
+        if heights.size:
+            axes.set_ylim(bottom=heights.min() / 1.5)
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes.yaxis.set_minor_formatter(NullFormatter())
