@@ -239,11 +239,14 @@ def test_a_second_signal_ends_the_process_at_once(monkeypatch):
 
 def test_a_sigterm_that_comes_twice_at_once_is_one(monkeypatch):
     """By a batch system and by `experiments.sweep`, which passes its own on."""
-    monkeypatch.setattr(experiments.run.os, "_exit", lambda code: pytest.fail("it left without saving"))
+    codes, now = [], []
+    monkeypatch.setattr(experiments.run.os, "_exit", codes.append)
+    monkeypatch.setattr(experiments.run.time, "monotonic", lambda: now[-1])
     with experiments.run._stop_on_signal() as received:
-        signal.raise_signal(signal.SIGTERM)
-        signal.raise_signal(signal.SIGTERM)
-        assert received == [signal.SIGTERM]
+        for at, left in [(100.0, []), (100.9, []), (102.0, [130])]:
+            now.append(at)
+            signal.raise_signal(signal.SIGTERM)
+            assert received[0] == signal.SIGTERM and codes == left
 
 
 def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
