@@ -337,7 +337,8 @@ DAMAGED = {
 def test_a_damaged_run_is_refused(folder, capsys, case):
     damage, takes = DAMAGED[case]
     damage(RUN / "config.json")
-    refused(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", takes)
+    further = ["--steps=160"] if case.startswith("table") else []  # else it is finished, and left as it is
+    refused(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", takes)
 
 
 ITS_OWN = r"takes the run's own settings; these differ: "

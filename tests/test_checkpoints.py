@@ -322,6 +322,7 @@ def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
 
 
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
+@pytest.mark.slow
 def test_members_come_back_on_any_devices_without_the_copies_that_filled_them(case, tmp_path):
     two = Case(devices=2)
     state = two.saved(two.store(tmp_path), 50, 90)

@@ -12,7 +12,7 @@ def whole(tmp_path_factory):
     return killtest.reference("tiny", "td3_sqt", tmp_path_factory.mktemp("whole") / "run")
 
 
-@pytest.mark.parametrize("number", range(2))
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_run_that_is_killed_ends_as_if_it_had_not_been(tmp_path, whole, number):
     line = killtest.kill_and_resume("tiny", "td3_sqt", tmp_path / "run", whole, number)
     assert "killed a" in line and line.endswith("resumed, identical")

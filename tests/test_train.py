@@ -183,6 +183,7 @@ def test_members_differ_in_parameters_starts_and_noise(td3):
     assert not np.isclose(actions[0], actions[1]).any()
 
 
+@pytest.mark.slow
 def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
     config, _, sweep = td3
     alone, together = start(config, sweep, (3,)), start(config, sweep, (0, 1, 2, 3))
