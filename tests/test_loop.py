@@ -120,8 +120,16 @@ def test_phases_and_time_left_are_shown():
     assert {"training", "evaluating"} <= set(phases)
     last = recorder.statuses[-1]
     assert last.phase == "evaluating" and last.env_steps == 2_000
-    assert last.eta == pytest.approx(0.5)  # the last evaluation itself
+    assert last.left == (pytest.approx(0.5), False)  # the last evaluation itself
     assert last.steps_per_second == pytest.approx(200)  # of both members
+
+
+def test_time_left_is_a_lower_bound_until_an_evaluation_was_timed():
+    recorder = Recorder(TrainConfig(steps=2_000, warmup_steps=100, eval_every=1_000))
+    recorder.run()
+    training = [status for status in recorder.statuses if status.phase == "training"]
+    for status in training[1:]:  # of the first, which was not timed before, nothing is known
+        assert status.left.at_least == (status.env_steps < 1_000)  # the first evaluation's time is its compilation's
 
 
 def test_stopping_reports_what_there_is():

@@ -8,11 +8,12 @@ from experiments.running.progress import (
     PLAIN_SECONDS,
     Display,
     Status,
+    TimeLeft,
     counting,
-    eta_seconds,
     evaluation_share,
     final_table,
     format_seconds,
+    time_left,
 )
 
 
@@ -20,16 +21,21 @@ def make_console(terminal):
     return Console(file=io.StringIO(), force_terminal=terminal, width=100, color_system=None, legacy_windows=False)
 
 
-def test_eta_adds_the_phases_and_the_evaluations():
+def test_time_left_adds_the_phases_and_the_evaluations():
     # 100 warm-up steps at 50/s, 600 learning steps at 20/s, 3 evaluations of 4 s: 2 + 30 + 12.
-    assert eta_seconds({False: 100, True: 600}, {False: 50.0, True: 20.0}, 3, 4.0) == 44.0
+    assert time_left({False: 100, True: 600}, {False: 50.0, True: 20.0}, 3, 4.0) == TimeLeft(44.0)
 
 
-def test_eta_is_unknown_while_what_is_left_was_never_timed():
-    assert eta_seconds({False: 0, True: 600}, {False: 50.0}, 0, None) is None
-    assert eta_seconds({False: 0, True: 600}, {True: 20.0}, 1, None) is None
-    assert eta_seconds({False: 100, True: 0}, {False: 50.0}, 0, None) == 2.0
-    assert eta_seconds({False: 0, True: 0}, {}, 0, None) == 0.0
+def test_time_left_is_unknown_while_steps_of_its_kind_were_never_timed():
+    assert time_left({False: 0, True: 600}, {False: 50.0}, 0, None) is None
+    assert time_left({False: 100, True: 0}, {False: 50.0}, 0, None) == TimeLeft(2.0)
+    assert time_left({False: 0, True: 0}, {}, 0, None) == TimeLeft(0.0)
+
+
+def test_evaluations_that_were_never_timed_make_the_time_left_a_lower_bound():
+    left = time_left({False: 0, True: 600}, {True: 20.0}, 1, None)
+    assert left == TimeLeft(30.0, at_least=True) and str(left) == "> 0:30"
+    assert str(time_left({False: 0, True: 600}, {True: 20.0}, 1, 4.0)) == "0:34"
 
 
 @pytest.mark.parametrize(
@@ -53,7 +59,7 @@ def test_plain_output_is_a_line_per_evaluation_and_few_others():
         display.update(Status("compiling the training", 0, None, None, None))
         for step in range(1, 61):  # a minute, one update a second
             now[0] = float(step)
-            display.update(Status("training", step, 123.4, 60.0 - step, 5.0))
+            display.update(Status("training", step, 123.4, TimeLeft(60.0 - step), 5.0))
         display.evaluated(60, np.array([1.0, 3.0]))
     lines = console.file.getvalue().splitlines()
     assert lines[0] == "compiling the training, step 0 of 1,000, - steps/s, return -, left -"
@@ -67,7 +73,7 @@ def test_plain_output_is_a_line_per_evaluation_and_few_others():
 def test_a_terminal_gets_a_live_line():
     console = make_console(terminal=True)
     with Display(console, 1_000) as display:
-        display.update(Status("warm-up", 250, 1234.0, 61.0, 5.0))
+        display.update(Status("warm-up", 250, 1234.0, TimeLeft(61.0), 5.0))
         display.evaluated(250, np.array([7.0]))
     text = console.file.getvalue()
     assert "\x1b[2K" in text  # the line is erased and written again

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from experiments.running.progress import Display, Status, eta_seconds
+from experiments.running.progress import Display, Status, TimeLeft, time_left
 from sqt_jax.config import TrainConfig
 from sqt_jax.train import Sweep, TrainState, evaluation_steps, new_interval
 
@@ -87,9 +87,9 @@ class Pace:
             self.evaluate_seconds += seconds
         self.evaluations += 1
 
-    def eta(self, done: int, evaluated: int, train: TrainConfig) -> float | None:
+    def time_left(self, done: int, evaluated: int, train: TrainConfig) -> TimeLeft | None:
         warmup_left = max(0, min(train.warmup_steps, train.steps) - done)
-        return eta_seconds(
+        return time_left(
             steps_left={False: warmup_left, True: train.steps - done - warmup_left},
             steps_per_second={learn: rate * train.num_envs for learn, rate in self.rates.items()},
             evaluations_left=sum(step > evaluated for step in evaluation_steps(train)),
@@ -135,7 +135,7 @@ def train_loop(
 
     def show(phase: str, learn: bool) -> None:
         rate = pace.rates[learn] * train.num_envs * num_members if learn in pace.rates else None
-        display.update(Status(phase, done, rate, pace.eta(done, evaluated, train), last_return))
+        display.update(Status(phase, done, rate, pace.time_left(done, evaluated, train), last_return))
 
     def evaluate_and_report() -> None:
         nonlocal last_return, evaluated

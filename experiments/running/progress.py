@@ -16,23 +16,32 @@ from rich.table import Table
 PLAIN_SECONDS = 10.0
 
 
+class TimeLeft(NamedTuple):
+    seconds: float
+    at_least: bool = False  # evaluations are still to come, and how long they take is not known yet
+
+    def __str__(self) -> str:
+        return f"{'> ' if self.at_least else ''}{format_seconds(self.seconds)}"
+
+
 class Status(NamedTuple):
     phase: str
     env_steps: int  # of one member
     steps_per_second: float | None  # environment steps of all members together; None: not measured yet
-    eta: float | None  # seconds; None: cannot be told yet
+    left: TimeLeft | None  # None: cannot be told yet
     last_return: float | None  # mean over members and episodes of the last evaluation
 
 
-def eta_seconds(
+def time_left(
     steps_left: Mapping[bool, int],
     steps_per_second: Mapping[bool, float],
     evaluations_left: int,
     seconds_per_evaluation: float | None,
-) -> float | None:
-    """Seconds until the end of a run, or None while a part of it that is still to come has not been timed.
+) -> TimeLeft | None:
+    """Until the end of a run, or None while steps are to come of a kind that has not been timed.
 
-    `steps_left` and `steps_per_second` are one member's, keyed by whether the steps learn.
+    `steps_left` and `steps_per_second` are one member's, keyed by whether the steps learn. Evaluations that were not
+    timed are left out, which the result says: the second one comes late in a run, or late after it was resumed.
     """
     seconds = 0.0
     for learn, steps in steps_left.items():
@@ -40,11 +49,9 @@ def eta_seconds(
             if learn not in steps_per_second:
                 return None
             seconds += steps / steps_per_second[learn]
-    if evaluations_left:
-        if seconds_per_evaluation is None:
-            return None
-        seconds += evaluations_left * seconds_per_evaluation
-    return seconds
+    if evaluations_left and seconds_per_evaluation is None:
+        return TimeLeft(seconds, at_least=True)
+    return TimeLeft(seconds + evaluations_left * (seconds_per_evaluation or 0.0))
 
 
 def format_seconds(seconds: float | None) -> str:
@@ -60,7 +67,7 @@ def _fields(status: Status) -> dict[str, Any]:
     rate, mean = status.steps_per_second, status.last_return
     return {
         "rate": "-" if rate is None else f"{rate:,.0f}",
-        "eta": format_seconds(status.eta),
+        "left": "-" if status.left is None else str(status.left),
         "mean": "-" if mean is None else f"{mean:,.1f}",
     }
 
@@ -84,13 +91,13 @@ class Display:
                 BarColumn(bar_width=None),
                 TextColumn(
                     "{task.completed:,}/{task.total:,}  {task.fields[rate]} steps/s  return {task.fields[mean]}  "
-                    "left {task.fields[eta]}"
+                    "left {task.fields[left]}"
                 ),
                 TimeElapsedColumn(),
                 console=self.console,
                 transient=True,
             )
-            self._task = self._bar.add_task("starting", total=self.steps, rate="-", mean="-", eta="-")
+            self._task = self._bar.add_task("starting", total=self.steps, rate="-", mean="-", left="-")
             self._bar.start()
         return self
 
@@ -109,7 +116,7 @@ class Display:
         if not self.quiet and (compiling or self.clock() - self._last_line >= PLAIN_SECONDS):
             self._line(
                 f"{status.phase}, step {status.env_steps:,} of {self.steps:,}, {fields['rate']} steps/s, "
-                f"return {fields['mean']}, left {fields['eta']}"
+                f"return {fields['mean']}, left {fields['left']}"
             )
         self._last_phase = status.phase
 
