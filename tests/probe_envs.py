@@ -1,5 +1,6 @@
 """Tiny environments with known Q-values, through the same wrapper as the real tasks."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -28,6 +29,7 @@ def shorter_than_it_says() -> Environment:
     return one_step()._replace(shortest_episode=8)
 
 
+@functools.cache  # the same environment is the same object, so that its runs can share their programs
 def constant_reward(episode_length: int = 5) -> Environment:
     """Reward 1 for ever; episodes end by the time limit alone, so Q = 1 / (1 - gamma) everywhere."""
 

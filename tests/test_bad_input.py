@@ -10,6 +10,7 @@ from pathlib import Path
 
 import probe_envs
 import pytest
+from shared_programs import shared_programs  # noqa: F401
 
 from experiments.run import main
 

@@ -65,7 +65,7 @@ def test_the_time_limit_truncates(pendulum):
     assert step(late, jnp.zeros(1)).truncated and not step(timestep, jnp.zeros(1)).truncated
 
 
-SLOW = {name: pytest.param(name, marks=pytest.mark.slow) for name in ("mjx", "generalized")}
+SLOW = {name: pytest.param(name, marks=pytest.mark.slow) for name in ("mjx", "generalized", "positional")}
 
 
 @pytest.mark.parametrize("physics", [SLOW.get(name, name) for name in PIPELINES])

@@ -293,6 +293,7 @@ def test_a_step_is_saved_again_after_its_evaluation(case, tmp_path):
     assert restored.position.evaluated == 60 and identical(restored.state, state)
 
 
+@pytest.mark.slow
 def test_several_environments_per_member_fill_the_ring_side_by_side(tmp_path):
     case = Case(num_envs=4)
     state = case.saved(case.store(tmp_path), 48, 100)

@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import probe_envs
 import pytest
+from shared_programs import shared_programs  # noqa: F401
 
 import experiments.run
 from experiments import records

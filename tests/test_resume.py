@@ -13,6 +13,7 @@ import jax
 import probe_envs
 import pytest
 from made_runs import write_run
+from shared_programs import shared_programs  # noqa: F401
 from test_cli import rows_of, run
 
 import experiments.run

@@ -337,7 +337,8 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     assert (metrics["train_length"] == 1).all()
 
 
-@pytest.mark.parametrize("algo", ["td3", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["td3", "sac"])
 def test_truncation_bootstraps_and_termination_does_not(algo):
     """Endless reward 1 is worth 1 / (1 - gamma) where only the time limit ends episodes; 3 steps of it 1 + g + g²."""
     values = {}
@@ -410,7 +411,8 @@ def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
         np.testing.assert_allclose(biases["value_bias_normalised"], biases["value_bias"] / 5, rtol=0.05)
 
 
-@pytest.mark.parametrize("algo", ["sac", pytest.param("td7", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["sac", "td7"])
 def test_critics_are_judged_by_the_policy_whose_values_they_estimate(algo):
     """SAC's critics by its samples, entropy included; TD7's by the checkpoint, which is what evaluation plays."""
     small = {"embedding_size": 16} if algo == "td7" else {}
