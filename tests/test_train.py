@@ -314,7 +314,7 @@ LEARN = {
 }
 
 
-@algorithm_rows.every(fast=("td3", "sac_sqt"))
+@algorithm_rows.every(fast=("sac_sqt",))
 def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     """On `one_step` the best action is obs and Q is the reward, whatever the penalty: every step is terminal."""
     settings = LEARN | ({} if "temperature" in ALGORITHMS[algo].ignores else {"temperature": 0.01})
