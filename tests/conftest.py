@@ -1,5 +1,6 @@
 """What all tests share: the cache of compiled programs, hypothesis' profile, strict promotion."""
 
+import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,20 @@ def strict_dtypes() -> Iterator[None]:
     not bear it.
     """
     with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def shared_programs() -> Iterator[None]:
+    """Runs of this process with the same settings share their compiled functions: most of a tiny run is tracing.
+
+    For modules that start many runs (`pytestmark = pytest.mark.usefixtures("shared_programs")`).
+    """
+    import experiments.run
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("make_trainer", "make_sweep"):
+            patch.setattr(experiments.run, name, functools.cache(getattr(experiments.run, name)))
         yield
 
 

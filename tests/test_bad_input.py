@@ -10,9 +10,10 @@ from pathlib import Path
 
 import probe_envs
 import pytest
-from shared_programs import shared_programs  # noqa: F401
 
 from experiments.run import main
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "

@@ -10,13 +10,14 @@ import sys
 import numpy as np
 import probe_envs
 import pytest
-from shared_programs import shared_programs  # noqa: F401
 
 import experiments.run
 from experiments import records
 from experiments.run import main
 from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 # The members and sizes that these runs have in common, so that they share compiled programs.
 TINY = (

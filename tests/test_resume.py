@@ -13,7 +13,6 @@ import jax
 import probe_envs
 import pytest
 from made_runs import write_run
-from shared_programs import shared_programs  # noqa: F401
 from test_cli import rows_of, run
 
 import experiments.run
@@ -24,6 +23,8 @@ from experiments.run import main
 from experiments.running import described, loop
 from experiments.running.resume import named
 from sqt_jax.envs import physics
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 MEMBERS = ("--penalty_coef=0,0.5", "--checkpoint_every=20")
 

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import probe_envs
 import pytest
-from shared_programs import shared_programs  # noqa: F401
 
 from experiments import run
 from experiments.running import loop
 from experiments.sweep import PRESETS, Preset, cells, finished, name_of, run_in_a_process, sweep
 from sqt_jax.algorithms import ALGORITHMS
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 TINY = "--seeds=0,1 --steps=60 --warmup_steps=30 --eval_every=30 --eval_episodes=1 --batch_size=8 --hidden=8 --quiet"
 GRID = Preset(("td3", "td3_sqt"), ("ant", "walker"))
