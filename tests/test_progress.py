@@ -40,7 +40,7 @@ def test_evaluations_that_were_never_timed_make_the_time_left_a_lower_bound():
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(None, "-"), (0.2, "0:00"), (59.6, "1:00"), (123, "2:03"), (3723, "1:02:03"), (360000, "100:00:00")],
+    [(0.2, "0:00"), (59.6, "1:00"), (123, "2:03"), (3723, "1:02:03"), (360000, "100:00:00")],
 )
 def test_seconds_as_text(seconds, text):
     assert format_seconds(seconds) == text

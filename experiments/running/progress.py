@@ -54,10 +54,8 @@ def time_left(
     return TimeLeft(seconds + evaluations_left * (seconds_per_evaluation or 0.0))
 
 
-def format_seconds(seconds: float | None) -> str:
-    """`1:02:03`, `2:03`, or `-` for None."""
-    if seconds is None:
-        return "-"
+def format_seconds(seconds: float) -> str:
+    """`1:02:03` or `2:03`."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"
