@@ -30,7 +30,6 @@ from absl import app, flags, logging
 from rich.console import Console
 from rich.table import Table
 
-from experiments import command_line, files
 from experiments.benchmarks import compare, growth, kernels, operations
 from experiments.benchmarks.measure import (
     REPLAYS,
@@ -46,8 +45,9 @@ from experiments.benchmarks.measure import (
 )
 from experiments.benchmarks.measure_checkpoints import bench_checkpoint
 from experiments.benchmarks.measure_memory import bench_memory
+from experiments.commandline import arguments
 from experiments.evidence.published import PAPERS_TASKS
-from experiments.running import runtime
+from experiments.running import files, runtime
 from sqt_jax import algorithms, envs
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # what is measured if nothing is said
@@ -117,7 +117,7 @@ def check_flags() -> None:
         sys.exit(f"--json: takes a file in a folder that is there, not {FLAGS.json!r}")
     if "growth" in FLAGS.suites:
         with leaving():
-            command_line.refuse_folder("--figures", Path(FLAGS.figures))
+            arguments.refuse_folder("--figures", Path(FLAGS.figures))
     for peer in FLAGS.compare:
         if not {*compare.ALGORITHMS[peer]} & {*FLAGS.algos}:
             sys.exit(f"--algos: takes some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
@@ -130,7 +130,7 @@ def leaving() -> Iterator[None]:
     """Leaves with the line of a `UsageError`."""
     try:
         yield
-    except command_line.UsageError as error:
+    except arguments.UsageError as error:
         sys.exit(str(error))
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments import run
-from experiments.running import described
+from experiments.running import run_config
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.envs.autoreset import make_environment
 from sqt_jax.types import Environment
@@ -86,14 +86,14 @@ def result_of(path: Path) -> dict[str, Any]:
     import orbax.checkpoint
 
     folder = max((path / "checkpoint").glob("step_*"))
-    members = len(described.read(path).members)
+    members = len(run_config.read(path).members)
     result: dict[str, Any] = dict(orbax.checkpoint.PyTreeCheckpointer().restore((folder / "state").absolute()))
     rows = []
     for file in sorted((path / "checkpoint").glob("rows_*.bin")):
         start, stop = (int(word) for word in file.stem.split("_")[1:])
         rows.append(np.fromfile(file, np.float32).reshape(members, stop - start, -1))
     # Of earlier ones a file may be left.
-    result["rows"] = np.concatenate(rows, axis=1)[:, -described.read(path).content["replay_rows"] :]
+    result["rows"] = np.concatenate(rows, axis=1)[:, -run_config.read(path).content["replay_rows"] :]
     for name in ("evaluations", "metrics"):
         with (path / f"{name}.csv").open(newline="") as table:
             result[name] = [

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags, logging
 
-from experiments import bench, command_line
+from experiments import bench
 from experiments.bench import check_flags, leaving, machine, physics_here, solver_limits
 from experiments.benchmarks.measure import env_steps
 from experiments.benchmarks.timing import measure_in_turns
+from experiments.commandline import arguments
 from experiments.gymnasium_parity.distributions import (
     Episodes,
     Starts,
@@ -209,7 +210,7 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     if FLAGS.out:
         with leaving():
-            command_line.refuse_file("--out", Path(FLAGS.out), overwrite=True)
+            arguments.refuse_file("--out", Path(FLAGS.out), overwrite=True)
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
     rows = cases(physics_here())
@@ -232,7 +233,7 @@ def main(argv: Sequence[str]) -> None:
     print(text)
     if FLAGS.out:
         with leaving():
-            command_line.write_file(Path(FLAGS.out), text.encode())
+            arguments.write_file(Path(FLAGS.out), text.encode())
 
 
 if __name__ == "__main__":

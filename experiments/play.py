@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from experiments import command_line, files
-from experiments.command_line import Parser, UsageError, between, guarded
+from experiments.commandline import arguments
+from experiments.commandline.arguments import Parser, UsageError, between, guarded
 from experiments.playing import films, graphics
+from experiments.running import files
 
 # All that brings MuJoCo is imported after the way to render has been chosen, and all that brings JAX after what can be
 # refused without it.
@@ -136,7 +137,7 @@ def _prepare(path: Path, options: argparse.Namespace) -> None:
             if given:
                 raise UsageError(f"{flag}: has no effect without --video")
         return
-    command_line.refuse_file("--video", options.video, options.overwrite)
+    arguments.refuse_file("--video", options.video, options.overwrite)
     name = _env_name(path)
     if name.startswith(BRAX):
         if films.format_of(options.video) != "html":

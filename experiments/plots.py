@@ -7,8 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import command_line
-from experiments.command_line import Parser, folder, guarded, one_of
+from experiments.commandline import arguments
+from experiments.commandline.arguments import Parser, folder, guarded, one_of
 
 EXAMPLE = "python -m experiments.plots RUNS... --out=figures"
 DESCRIPTION = """\
@@ -34,16 +34,16 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    from experiments.evidence import collected, figures  # these and what they bring take a second or two
+    from experiments.evidence import figures, pooling  # these and what they bring take a second or two
 
-    runs = collected.collect(options.runs)
+    runs = pooling.collect(options.runs)
     draw = figures.every(runs, options.statistic)
-    command_line.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
+    arguments.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
     drawn = {name: function() for name, function in draw.items()}
     contents = {
         f"{name}.{options.format}": figures.image(figure, options.format) for name, figure in drawn.items() if figure
     }
-    command_line.write_files(options.out, contents)
+    arguments.write_files(options.out, contents)
     for name in contents:
         print(options.out / name)
     empty = [name for name, figure in drawn.items() if figure is None]

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from experiments import command_line
-from experiments.command_line import Parser, file, guarded, one_of, printable
+from experiments.commandline import arguments
+from experiments.commandline.arguments import Parser, file, guarded, one_of, printable
 from experiments.plots import STATISTICS
 
 EXAMPLE = "python -m experiments.report RUNS... --out=report.html"
@@ -35,21 +35,21 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    command_line.refuse_file("--out", options.out, options.overwrite)
-    from experiments.evidence import collected, figures, page, run_details, tabulated
-    from experiments.running import described  # they take a second or two
+    arguments.refuse_file("--out", options.out, options.overwrite)
+    from experiments.evidence import figures, page, paper_tables, pooling, run_details
+    from experiments.running import run_config  # they take a second or two
 
-    runs = collected.collect(options.runs)
+    runs = pooling.collect(options.runs)
     content = page.Content(
         runs,
-        tabulated.make_tables(runs, options.reference, tabulated.task_sizes(runs)),
+        paper_tables.make_tables(runs, options.reference, paper_tables.task_sizes(runs)),
         {name: draw() for name, draw in figures.every(runs, options.statistic).items()},
         run_details.read_all(runs),
         datetime.now(UTC),
-        f"sqt_jax {described.versions()['sqt_jax'] or 'of an unknown version'}",
+        f"sqt_jax {run_config.versions()['sqt_jax'] or 'of an unknown version'}",
         shlex.join(["python", "-m", "experiments.report", *argv[1:]]),
     )
-    command_line.write_file(options.out, page.page(content).encode())
+    arguments.write_file(options.out, page.page(content).encode())
     print(printable(str(options.out)))
     for note in runs.notes:
         print(printable(note), file=sys.stderr)

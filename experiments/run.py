@@ -21,8 +21,9 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from experiments.command_line import UsageError, printable
-from experiments.running import flag_table, flags, progress, runtime
+from experiments.commandline import flag_table, flags
+from experiments.commandline.arguments import UsageError, printable
+from experiments.running import progress, runtime
 from experiments.running.loop import BEGINNING, Outcome, Position, train_loop
 from sqt_jax.algorithms import agent_of, make_trainer, replay_of
 from sqt_jax.policy import save_policy
@@ -32,17 +33,17 @@ from sqt_jax.types import Array, Environment, Scalars
 # `plan`, `records` and `figures` bring SciPy, TensorBoard and matplotlib, as much to import as all the rest: they are
 # imported where they are used, so that a typing error is answered in a second.
 if TYPE_CHECKING:
-    from experiments.checkpoints import Checkpoints, Restored
-    from experiments.records import Records
-    from experiments.running.described import Described
+    from experiments.running.checkpoints import Checkpoints, Restored
     from experiments.running.plan import Plan
+    from experiments.running.records import Records
+    from experiments.running.run_config import Described
 
 DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 def run(plan: "Plan", command: Sequence[str]) -> int:
     """Trains and records; the exit code."""
-    from experiments import checkpoints
+    from experiments.running import checkpoints
 
     console = Console()
     with ExitStack() as stack:
@@ -94,7 +95,7 @@ def run(plan: "Plan", command: Sequence[str]) -> int:
 
 def _lock(plan: "Plan", stack: ExitStack) -> None:
     """Makes the run's folder this process's own, until the stack is left."""
-    from experiments import files
+    from experiments.running import files
 
     try:
         stack.enter_context(files.locked(plan.path))
@@ -146,7 +147,7 @@ def _refuse_to_begin_again(path: Path, checkpoint_every: object) -> None:
 
 def _reached(path: Path) -> int:
     """The env steps of the last row of evaluations.csv; 0 where there is none."""
-    from experiments import records
+    from experiments.running import records
 
     try:
         return int(max(records.read_evaluations(path / "evaluations.csv")["env_steps"], default=0))
@@ -167,8 +168,7 @@ def _summary(plan: "Plan") -> Path:
 
 def _claim(plan: "Plan", command: Sequence[str]) -> None:
     """Makes the folder a run: writes config.json into it, where nothing else is or what is there may be replaced."""
-    from experiments import records
-    from experiments.running import described
+    from experiments.running import records, run_config
     from experiments.running.plan import not_a_run, taken
 
     try:
@@ -176,8 +176,8 @@ def _claim(plan: "Plan", command: Sequence[str]) -> None:
             records.remove_run(plan.path)
         if records.is_taken(plan.path):
             raise UsageError(taken(plan.path))
-        content = described.describe(plan.members, plan.swept, command, plan.options.preset, plan.output)
-        described.write(plan.path, content)
+        content = run_config.describe(plan.members, plan.swept, command, plan.options.preset, plan.output)
+        run_config.write(plan.path, content)
     except records.NotARun:
         raise UsageError(not_a_run(plan.path)) from None
     except OSError as error:
@@ -186,11 +186,11 @@ def _claim(plan: "Plan", command: Sequence[str]) -> None:
 
 def _go_on(plan: "Plan", run: "Described", restored: "Restored | None", command: Sequence[str]) -> None:
     """Says in config.json that the run goes on, and removes what told of its end."""
-    from experiments.running import described
+    from experiments.running import run_config
 
     at = restored.position.env_steps if restored else 0
     try:
-        described.write(plan.path, described.resumed(run.content, plan.train.steps, plan.output, at, command))
+        run_config.write(plan.path, run_config.resumed(run.content, plan.train.steps, plan.output, at, command))
         _summary(plan).unlink(missing_ok=True)
     except OSError as error:
         raise _cannot_write(plan, error) from None
@@ -198,18 +198,18 @@ def _go_on(plan: "Plan", run: "Described", restored: "Restored | None", command:
 
 def _tables(plan: "Plan", restored: "Restored | None", warn: Callable[[str], None]) -> "Records":
     """The run's tables: new ones, or those of the resumed run as they were at its checkpoint."""
-    from experiments import csv_table, records
+    from experiments.running import csv_rows, records
 
     resumed_at = None
     if plan.resumed:
         resumed_at = (restored.position.env_steps, restored.lengths) if restored else (-1, {})
     try:
         return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, warn)
-    except csv_table.Shortened as error:
+    except csv_rows.Shortened as error:
         raise UsageError(
             f"--resume={plan.path}: {error} has lost rows since the checkpoint; takes a run with whole tables"
         ) from None
-    except csv_table.OtherColumns as error:
+    except csv_rows.OtherColumns as error:
         raise UsageError(f"--resume={plan.path}: takes a run of this version; {error} has other columns") from None
     except OSError as error:
         raise _cannot_write(plan, error) from None
@@ -277,8 +277,8 @@ def _train(
 
 def _results(plan: "Plan", outcome: Outcome) -> bool:
     """Writes the policies and, where there are evaluations, the curves; whether there are."""
-    from experiments import records
     from experiments.evidence import figures
+    from experiments.running import records
 
     policy, part = plan.path / "policy", plan.path / "policy.part"
     shutil.rmtree(part, ignore_errors=True)

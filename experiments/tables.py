@@ -6,8 +6,8 @@ Exit codes: 0 done; 2 bad usage (one line, nothing written).
 import sys
 from collections.abc import Sequence
 
-from experiments import command_line
-from experiments.command_line import Parser, folder, guarded, one_of
+from experiments.commandline import arguments
+from experiments.commandline.arguments import Parser, folder, guarded, one_of
 
 EXAMPLE = "python -m experiments.tables RUNS... --out=tables"
 DESCRIPTION = """\
@@ -34,20 +34,20 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    from experiments.evidence import collected, formats, tabulated  # these and what they bring take a second or two
+    from experiments.evidence import formats, paper_tables, pooling  # these and what they bring take a second or two
 
-    runs = collected.collect(options.runs)
+    runs = pooling.collect(options.runs)
     if options.out:
-        names = [f"{name}.{suffix}" for name in tabulated.NAMES for suffix, _ in formats.FORMATS.values()]
-        command_line.refuse_existing(options.out, names, options.overwrite)
-    tables = tabulated.make_tables(runs, options.reference, tabulated.task_sizes(runs))
+        names = [f"{name}.{suffix}" for name in paper_tables.NAMES for suffix, _ in formats.FORMATS.values()]
+        arguments.refuse_existing(options.out, names, options.overwrite)
+    tables = paper_tables.make_tables(runs, options.reference, paper_tables.task_sizes(runs))
     if options.out:
         contents = {
             f"{table.name}.{suffix}": write(table).encode()
             for table in tables
             for suffix, write in formats.FORMATS.values()
         }
-        command_line.write_files(options.out, contents)
+        arguments.write_files(options.out, contents)
     if options.format == "terminal" and sys.stdout.isatty():
         from rich.console import Console
 

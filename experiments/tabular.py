@@ -27,13 +27,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from experiments import command_line
-from experiments.command_line import UsageError, printable
+from experiments.commandline import arguments
+from experiments.commandline.arguments import UsageError, printable
+from experiments.commandline.flags import ABSL_FLAGS
 from experiments.running import runtime
-from experiments.running.flags import ABSL_FLAGS
 from experiments.running.progress import format_seconds
-from experiments.theorem import contraction, mdps, tabular_agents, tabular_figure
-from experiments.theorem import tabular_report as report
+from experiments.theorem import claims as report
+from experiments.theorem import contraction, mdps, q_learning, value_figure
 from sqt_jax.names import nearest, unknown
 
 DONE, BAD_USAGE, INTERRUPTED = 0, 2, 130
@@ -52,14 +52,14 @@ def define_flags() -> absl_flags.FlagValues:
 
     integer, number = absl_flags.DEFINE_integer, absl_flags.DEFINE_float
     define(absl_flags.DEFINE_list, "mdps", list(mdps.MDPS), f"MDPs: {', '.join(mdps.MDPS)}.")
-    algos = list(tabular_agents.algorithms())
+    algos = list(q_learning.algorithms())
     define(absl_flags.DEFINE_list, "algos", algos, f"Algorithms: {', '.join(algos)}.")
     define(absl_flags.DEFINE_list, "coefs", ["0", "0.1", "0.25", "0.5", "1"], "SQT's penalty coefficients.")
     define(integer, "seeds", 20, "Number of seeds.", lower_bound=1, upper_bound=10_000)
     define(integer, "steps", 200_000, "Steps per member.", lower_bound=FIRST_CHECKPOINT, upper_bound=10**8)
     define(integer, "tables", 4, "Tables of MaxMin and SQT.", lower_bound=2, upper_bound=100)
     define(integer, "ddof", 1, "The std over tables divides by N - ddof.", lower_bound=0, upper_bound=1)
-    define(absl_flags.DEFINE_string, "greedy", "min", f"Chooses SQT's a': {', '.join(tabular_agents.GREEDY)}.")
+    define(absl_flags.DEFINE_string, "greedy", "min", f"Chooses SQT's a': {', '.join(q_learning.GREEDY)}.")
     define(number, "gamma", 0.8, "Discount factor, above 0 and below 1.", lower_bound=0.0)
     define(number, "lr_power", 0.7, "Step size 1 / n(s, a)^lr_power, above 0.5 and up to 1.", upper_bound=1.0)
     define(number, "epsilon", 1.0, "Share of random actions; 1: uniform.", lower_bound=0.0, upper_bound=1.0)
@@ -96,13 +96,13 @@ def parse(argv: Sequence[str]) -> dict[str, Any]:
     if rest:
         raise UsageError(f"{rest[0]}: unexpected argument; settings are given as --flag=value")
     flag: dict[str, Any] = {name: values[name].value for name in values}
-    for name, known in (("mdps", mdps.MDPS), ("algos", tabular_agents.algorithms())):
+    for name, known in (("mdps", mdps.MDPS), ("algos", q_learning.algorithms())):
         _check_list(name, flag[name])
         for word in flag[name]:
             if word not in known:
                 raise UsageError(f"--{name}: {unknown(word, known)}")
-    if flag["greedy"] not in tabular_agents.GREEDY:
-        raise UsageError(f"--greedy: {unknown(flag['greedy'], tabular_agents.GREEDY)}")
+    if flag["greedy"] not in q_learning.GREEDY:
+        raise UsageError(f"--greedy: {unknown(flag['greedy'], q_learning.GREEDY)}")
     _check_list("coefs", flag["coefs"])
     coefs = [_coefficient(word) for word in flag["coefs"]]
     _check_list("coefs", coefs)
@@ -142,13 +142,13 @@ def _check_out(name: str, overwrite: bool) -> None:
     path = Path(name)
     if not name or "\0" in name:
         raise UsageError("--out: takes a folder")
-    command_line.refuse_folder("--out", path)
+    arguments.refuse_folder("--out", path)
     try:
         if not overwrite and path.exists() and any(path.iterdir()):
             raise UsageError(f"--out={name}: is there already; takes another folder, or --overwrite beside it")
     except OSError as error:
         raise UsageError(f"--out={name}: takes a folder that can be read: {error.strerror}") from None
-    command_line.refuse_existing(path, (TABLE, FIGURE), overwrite)
+    arguments.refuse_existing(path, (TABLE, FIGURE), overwrite)
 
 
 def checkpoints(steps: int) -> np.ndarray:
@@ -157,15 +157,15 @@ def checkpoints(steps: int) -> np.ndarray:
     return np.unique(np.round(np.geomspace(FIRST_CHECKPOINT, steps, count)).astype(int))
 
 
-def models(name: str, seeds: int, gamma: float) -> tabular_agents.Model:
+def models(name: str, seeds: int, gamma: float) -> q_learning.Model:
     """One MDP for each seed, stacked; they are all the same where the MDP has nothing random."""
     found = [mdps.centred(mdps.MDPS[name](seed), gamma) for seed in range(seeds)]
-    return tabular_agents.model_of(mdps.stack(found), np.stack([mdps.optimal_q(mdp, gamma) for mdp in found]))
+    return q_learning.model_of(mdps.stack(found), np.stack([mdps.optimal_q(mdp, gamma) for mdp in found]))
 
 
 def run(flag: dict[str, Any]) -> Iterator[tuple[report.Names, report.Curves, float]]:
     """The algorithms on the MDPs one after the other, and the share of the work that is done."""
-    table = tabular_agents.algorithms(flag["tables"], flag["ddof"], flag["greedy"], flag["weighted_c"])
+    table = q_learning.algorithms(flag["tables"], flag["ddof"], flag["greedy"], flag["weighted_c"])
     steps = checkpoints(flag["steps"])
     lengths = jnp.asarray(np.diff(steps, prepend=0), jnp.int32)
     seeds = jnp.arange(flag["seeds"])
@@ -174,7 +174,7 @@ def run(flag: dict[str, Any]) -> Iterator[tuple[report.Names, report.Curves, flo
     for algo in flag["algos"]:
         settings = {key: flag[key] for key in ("gamma", "epsilon", "ddof", "init_std")}
         settings |= {"algorithm": table[algo], "power": flag["lr_power"]}
-        programs[algo] = jax.jit(functools.partial(tabular_agents.sweep, **settings))
+        programs[algo] = jax.jit(functools.partial(q_learning.sweep, **settings))
     done, total = 0, len(flag["mdps"]) * len(flag["algos"])
     for mdp in flag["mdps"]:
         model = models(mdp, flag["seeds"], flag["gamma"])
@@ -196,7 +196,7 @@ def settings_of(flag: dict[str, Any]) -> list[str]:
         f"MaxMin and SQT: {flag['tables']} tables, ddof {flag['ddof']}, a' greedy by the {flag['greedy']}; weighted "
         f"Double Q: c {flag['weighted_c']:g}; initial values "
         + (f"N(0, {flag['init_std']:g}^2)" if flag["init_std"] else "0"),
-        "T: the expected target of eq. 13 as theorem/tabular_agents.py states it; the paper itself was not at hand",
+        "T: the expected target of eq. 13 as theorem/q_learning.py states it; the paper itself was not at hand",
         *(mdps.ABOUT[name] for name in flag["mdps"]),
     ]
 
@@ -269,7 +269,7 @@ def measure(flag: dict[str, Any], out: Path, argv: Sequence[str]) -> int:
                 status.update(line)
             else:
                 console.print(line, highlight=False)
-    sqt = tabular_agents.algorithms(flag["tables"], flag["ddof"], flag["greedy"])["sqt"]
+    sqt = q_learning.algorithms(flag["tables"], flag["ddof"], flag["greedy"])["sqt"]
     expansions = report.expansions(sqt, flag["coefs"], flag["ddof"], contraction.PAIRS)
     table, expansion = report.cells(results), report.expansion_table(expansions)
     found = statements(flag, results, expansions)
@@ -280,8 +280,8 @@ def measure(flag: dict[str, Any], out: Path, argv: Sequence[str]) -> int:
     command = shlex.join(["python", "-m", "experiments.tabular", *argv[1:]])
     text = report.markdown(command, settings_of(flag), table, found, expansion)
     picture = io.BytesIO()
-    tabular_figure.draw(results, picture)
-    command_line.write_files(out, {TABLE: text.encode(), FIGURE: picture.getvalue()})
+    value_figure.draw(results, picture)
+    arguments.write_files(out, {TABLE: text.encode(), FIGURE: picture.getvalue()})
     console.print(f"\n{out / TABLE}, {out / FIGURE}", soft_wrap=True, highlight=False, markup=False)
     return DONE
 

@@ -36,6 +36,7 @@ class Algorithm(NamedTuple):
     training: Mapping[str, Any] = MappingProxyType({})  # and from TrainConfig's
     ignores: frozenset[str] = frozenset()  # settings that have no effect
     assessed: bool = False  # TD7: LAP replay, and policy checkpoints, which take one stream of episodes
+    baseline: str | None = None  # what it is compared with: the same algorithm without a penalty
 
 
 TEMPERATURE = frozenset({"temperature", "learn_temperature", "squashed_log_prob"})
@@ -77,18 +78,18 @@ def _td7(settings: dict[str, Any]) -> Algorithm:
 
 ALGORITHMS: dict[str, Algorithm] = {
     "td3": _td3({}),
-    "td3_sqt": _td3(SQT),
-    "td3_sqt_tuple": _td3(SQT_TUPLE),
+    "td3_sqt": _td3(SQT)._replace(baseline="td3"),
+    "td3_sqt_tuple": _td3(SQT_TUPLE)._replace(baseline="td3"),
     "sac": _sac({}),
-    "sac_sqt": _sac(SQT),
-    "sac_sqt_tuple": _sac(SQT_TUPLE),
+    "sac_sqt": _sac(SQT)._replace(baseline="sac"),
+    "sac_sqt_tuple": _sac(SQT_TUPLE)._replace(baseline="sac"),
     "td7": _td7({}),
-    "td7_sqt": _td7(SQT),
-    "td7_sqt_tuple": _td7(SQT_TUPLE),
+    "td7_sqt": _td7(SQT)._replace(baseline="td7"),
+    "td7_sqt_tuple": _td7(SQT_TUPLE)._replace(baseline="td7"),
     "maxmin": _td3(MAXMIN),
-    "maxmin_sqt": _td3(MAXMIN | SQT),
+    "maxmin_sqt": _td3(MAXMIN | SQT)._replace(baseline="maxmin"),
     "redq": _sac(REDQ, updates_per_step=5),
-    "redq_sqt": _sac(REDQ | SQT, updates_per_step=5),
+    "redq_sqt": _sac(REDQ | SQT, updates_per_step=5)._replace(baseline="redq"),
 }
 
 AGENT_SETTINGS = frozenset(field.name for field in dataclasses.fields(AgentConfig))

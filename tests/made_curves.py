@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from experiments.theorem.tabular_agents import Record
-from experiments.theorem.tabular_report import Curves
+from experiments.theorem.claims import Curves
+from experiments.theorem.q_learning import Record
 
 STEPS = np.array([100, 1000, 10_000])
 

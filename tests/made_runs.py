@@ -8,8 +8,8 @@ from unittest import mock
 import jax
 import numpy as np
 
-from experiments.records import EVALUATION_COLUMNS
-from experiments.running import described
+from experiments.running import run_config
+from experiments.running.records import EVALUATION_COLUMNS
 from sqt_jax.algorithms import agent_of, make_config
 from sqt_jax.policy import save_policy
 
@@ -90,7 +90,7 @@ def add_policies(path, env, returns=None):
     Args:
       env: an `Environment` of the run's sizes.
     """
-    run = described.read(path)
+    run = run_config.read(path)
     config, count = run.members[0].config, len(run.members)
     agent, generator = agent_of(config, env), np.random.default_rng(1)
     shapes = jax.eval_shape(lambda key: jax.vmap(agent.init)(jax.random.split(key, count)), jax.random.key(1))

@@ -422,7 +422,7 @@ def test_a_file_in_a_runs_place_is_not_replaced(folder, capsys):
 
 HOLD = """
 import sys, pathlib
-from experiments import files
+from experiments.running import files
 with files.locked(pathlib.Path(sys.argv[1])):
     print("locked", flush=True)
     sys.stdin.read()

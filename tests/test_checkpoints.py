@@ -11,9 +11,8 @@ import probe_envs
 import pytest
 from test_train import identical, make, start
 
-from experiments import checkpoints, files
-from experiments.checkpoints import Checkpoints
-from experiments.running import manifests
+from experiments.running import checkpoints, files, manifests
+from experiments.running.checkpoints import Checkpoints
 from experiments.running.loop import Position
 from experiments.running.manifests import Refused
 from sqt_jax import train

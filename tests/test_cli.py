@@ -12,8 +12,8 @@ import probe_envs
 import pytest
 
 import experiments.run
-from experiments import records
 from experiments.run import main
+from experiments.running import records
 from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
 

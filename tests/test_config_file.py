@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.running import config_file
+from experiments.commandline import config_file
 
 
 def test_lines_are_arguments(tmp_path):

@@ -3,8 +3,8 @@ from figure_reader import legend_of, panels
 from made_runs import write_run
 from matplotlib.colors import to_rgb
 
-from experiments.evidence.collected import collect
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, FORM_LINES, Stars, finish, make_panels, styles
+from experiments.evidence.pooling import collect
 from sqt_jax.algorithms import ALGORITHMS
 
 

@@ -5,11 +5,11 @@ from made_runs import write_run
 from matplotlib.image import imread
 
 from experiments.evidence import figures
-from experiments.evidence.collected import collect
+from experiments.evidence.cells import NOT_RESAMPLED
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS
 from experiments.evidence.figures import draw_curves, over_time, penalty_sweep
-from experiments.evidence.table_parts import NOT_RESAMPLED
-from experiments.records import EVALUATION_COLUMNS
+from experiments.evidence.pooling import collect
+from experiments.running.records import EVALUATION_COLUMNS
 
 NAN = float("nan")
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from experiments import files
+from experiments.running import files
 
 HOLD = """
 import sys, pathlib
-from experiments import files
+from experiments.running import files
 with files.locked(pathlib.Path(sys.argv[1])):
     print("locked", flush=True)
     sys.stdin.read()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from made_runs import write_run
 
-from experiments.command_line import UsageError
+from experiments.commandline.arguments import UsageError
 from experiments.evidence.finished_runs import find, read_run
 
 

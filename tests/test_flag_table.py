@@ -3,7 +3,7 @@
 import dataclasses
 import re
 
-from experiments.running import flag_table
+from experiments.commandline import flag_table
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.config import SALE_SETTINGS, TD7_SETTINGS, AgentConfig, TrainConfig
 

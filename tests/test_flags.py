@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from experiments.running import flags
+from experiments.commandline import flags
 
 
 def parse(*arguments):

@@ -5,8 +5,8 @@ import re
 import pytest
 from rich.console import Console
 
+from experiments.evidence.cells import Cell, Line, Table
 from experiments.evidence.formats import FORMATS, comma_separated, latex, markdown, rich_table, terminal
-from experiments.evidence.table_parts import Cell, Line, Table
 
 TABLE = Table(
     "table2",

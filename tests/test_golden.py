@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.presets import preset_settings
+from experiments.commandline.presets import preset_settings
 from sqt_jax import lap, q_targets
 from sqt_jax.agents import sac, td3, td7
 from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS

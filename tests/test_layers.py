@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # From the ground up; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
     {"sqt_jax.types", "sqt_jax.names"},
-    {"sqt_jax.cores", "sqt_jax.members", "sqt_jax.rarely", "sqt_jax.trees"},
+    {"sqt_jax.cores", "sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
     {
         "sqt_jax.config",
         "sqt_jax.q_targets",
@@ -29,8 +29,9 @@ LAYERS = [
     {"sqt_jax.algorithms"},
     {"sqt_jax.policy"},
     {"sqt_jax"},
-    {"experiments", "experiments.files", "experiments.csv_table", "experiments.statistics"},
-    {"experiments.command_line"},
+    {"experiments"},
+    {"experiments.running.files", "experiments.running.csv_rows", "experiments.evidence.statistics"},
+    {"experiments.commandline"},
     {"experiments.running"},
     {"experiments.evidence"},
     {
@@ -45,6 +46,7 @@ LAYERS = [
 PACKAGES = (
     "sqt_jax.agents",
     "sqt_jax.envs",
+    "experiments.commandline",
     "experiments.running",
     "experiments.evidence",
     "experiments.playing",
@@ -52,8 +54,8 @@ PACKAGES = (
     "experiments.gymnasium_parity",
     "experiments.theorem",
 )
-# Parts of a package that people look for one folder higher.
-HIGHER = {f"experiments.{name}": "experiments.running" for name in ("presets", "records", "checkpoints")}
+# Parts of a package that lie on a lower layer than the rest of it.
+LOWER = {"experiments.running.files", "experiments.running.csv_rows", "experiments.evidence.statistics"}
 # Beyond the order of the layers.
 REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
 NETWORKS = ("sqt_jax.networks", "sqt_jax.sale", "sqt_jax.losses", "sqt_jax.q_targets")
@@ -110,7 +112,9 @@ def inside(module: str, package: str) -> bool:
 
 def unit(module: str) -> str:
     """The package of the layers that a module belongs to, or itself."""
-    return next((package for package in PACKAGES if inside(module, package)), HIGHER.get(module, module))
+    if module in LOWER:
+        return module
+    return next((package for package in PACKAGES if inside(module, package)), module)
 
 
 def layer(module: str) -> int:

@@ -4,17 +4,17 @@ import pytest
 from html_reader import Reader
 from made_runs import write_run
 
-from experiments.evidence import figures, run_details, tabulated
-from experiments.evidence.collected import collect
+from experiments.evidence import figures, paper_tables, run_details
+from experiments.evidence.cells import Cell
 from experiments.evidence.page import Content, page, sort_key
-from experiments.evidence.table_parts import Cell
+from experiments.evidence.pooling import collect
 
 
 def content_of(folder, reference=False):
     runs = collect([str(folder)])
     return Content(
         runs,
-        tabulated.make_tables(runs, reference),
+        paper_tables.make_tables(runs, reference),
         {name: draw() for name, draw in figures.every(runs, "iqm").items()},
         run_details.read_all(runs),
         datetime(2026, 1, 2, 3, 4, tzinfo=UTC),

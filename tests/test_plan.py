@@ -6,7 +6,8 @@ import jax
 import probe_envs
 import pytest
 
-from experiments.running import described, flags
+from experiments.commandline import flags
+from experiments.running import run_config
 from experiments.running.plan import make_plan
 
 NEW = (
@@ -24,8 +25,8 @@ def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", **output):
     """A run that has written its config.json."""
     made = plan(out, f"--name={name}", *arguments)
     made.path.mkdir(parents=True)
-    content = described.describe(made.members, made.swept, ["run"], made.options.preset, made.output | output)
-    described.write(made.path, content | {"started": started})
+    content = run_config.describe(made.members, made.swept, ["run"], made.options.preset, made.output | output)
+    run_config.write(made.path, content | {"started": started})
     return made.path
 
 

@@ -8,7 +8,7 @@ import probe_envs
 import pytest
 from made_runs import add_policies, write_run
 
-from experiments.command_line import UsageError
+from experiments.commandline.arguments import UsageError
 from experiments.playing import policies
 from sqt_jax import envs
 

@@ -15,7 +15,7 @@ import numpy as np
 import probe_envs
 import pytest
 
-from experiments.presets import preset_settings
+from experiments.commandline.presets import preset_settings
 from sqt_jax import algorithms, policy
 from sqt_jax.algorithms import ALGORITHMS
 

@@ -3,7 +3,7 @@ import jax
 import pytest
 from probe_envs import constant_reward
 
-from experiments.presets import PRESETS, Row, preset_settings
+from experiments.commandline.presets import PRESETS, Row, preset_settings
 from sqt_jax.algorithms import ALGORITHMS, make_config, make_train
 from sqt_jax.config import ConfigError
 

@@ -9,7 +9,7 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench, play, plots, report, run, tables
-from experiments.running import flags
+from experiments.commandline import flags
 from experiments.running.plan import make_plan
 
 ROOT = Path(__file__).parent.parent

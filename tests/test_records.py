@@ -5,15 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import records
-from experiments.records import (
+from experiments.running import records
+from experiments.running.loop import Outcome, Report
+from experiments.running.records import (
     EVALUATION_COLUMNS,
     Records,
     read_evaluations,
     summarise,
 )
-from experiments.running.described import make_members
-from experiments.running.loop import Outcome, Report
+from experiments.running.run_config import make_members
 from sqt_jax.algorithms import make_config
 
 

@@ -16,11 +16,10 @@ from made_runs import write_run
 from test_cli import rows_of, run
 
 import experiments.run
-from experiments import checkpoints, records
-from experiments.command_line import UsageError
+from experiments.commandline.arguments import UsageError
 from experiments.killtest import differences, result_of
 from experiments.run import main
-from experiments.running import described, loop
+from experiments.running import checkpoints, loop, records, run_config
 from experiments.running.resume import named
 from sqt_jax.envs import physics
 
@@ -196,7 +195,7 @@ def test_tables_of_a_resumed_run_that_cannot_be_written_are_named_by_its_flag(tm
         experiments.run._tables(plan, None, print)
 
 
-@pytest.mark.parametrize("where", ["described.write", "Records", "train_loop"])
+@pytest.mark.parametrize("where", ["run_config.write", "Records", "train_loop"])
 def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monkeypatch, whole, where):
     """Wherever: the same command with --resume is understood."""
 
@@ -207,7 +206,7 @@ def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monk
         raise Killed
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        target = {"described.write": described, "Records": records, "train_loop": experiments.run}[where]
+        target = {"run_config.write": run_config, "Records": records, "train_loop": experiments.run}[where]
         patch.setattr(target, where.split(".")[-1], die)
         run(tmp_path, *MEMBERS)
     assert run(tmp_path, *MEMBERS, "--resume") == 0
@@ -264,7 +263,7 @@ def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatc
 
 def test_a_run_is_evaluated_on_the_physics_that_it_began_with(tmp_path, monkeypatch):
     """Whatever --eval_physics=auto would choose on this machine, which is mujoco on a CPU."""
-    path = write_run(tmp_path, physics="mujoco", versions=described.versions())
+    path = write_run(tmp_path, physics="mujoco", versions=run_config.versions())
     content = json.loads((path / "config.json").read_text())
     (path / "config.json").write_text(json.dumps(content | {"evaluated_on": "mjx"}))
     for wanted in ({}, {"eval_physics": "auto"}):  # its own setting is still what it was

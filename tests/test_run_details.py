@@ -3,9 +3,9 @@ import json
 import pytest
 from made_runs import write_run
 
-from experiments.command_line import UsageError
+from experiments.commandline.arguments import UsageError
 from experiments.evidence import run_details
-from experiments.evidence.collected import collect
+from experiments.evidence.pooling import collect
 
 NAN = float("nan")
 

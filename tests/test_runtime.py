@@ -12,7 +12,8 @@ from sqt_jax.cores import usable_cores
 ROOT = Path(__file__).parents[1]
 PROGRAM = """
 import sys
-from experiments.running import flags, runtime
+from experiments.commandline import flags
+from experiments.running import runtime
 runtime.prepare()
 from experiments.running.plan import make_plan
 print(len(make_plan(flags.parse(["run", *sys.argv[1:]])).layout.devices))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import experiments
-from experiments.statistics import (
+from experiments.evidence.statistics import (
     bootstrap,
     exceeds,
     improvement,

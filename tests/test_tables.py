@@ -89,7 +89,7 @@ def test_two_runs_with_the_same_seed_are_refused(runs, capsys):
 
 def test_a_typing_error_is_answered_without_jax():
     code = (
-        "import sys; from experiments import tables, plots, statistics; "
+        "import sys; from experiments import tables, plots; from experiments.evidence import statistics; "
         "assert tables.main(['tables', 'x', '--no']) == plots.main(['plots', 'x', '--no']) == 2; "
         "assert not {'jax', 'matplotlib', 'scipy'} & {*sys.modules}"
     )

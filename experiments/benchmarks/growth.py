@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-from experiments import files
 from experiments.benchmarks.measure import REPLAYS, Case, Failure, Row, in_turns, replay_case, updates
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
+from experiments.running import files
 from sqt_jax.members import usable_devices
 
 MEMBERS = (1, 2, 5, 10, 25, 50)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.measure import Row, member_keys
-from experiments.checkpoints import Checkpoints
+from experiments.running.checkpoints import Checkpoints
 from experiments.running.loop import Position
 from sqt_jax import algorithms, envs, train
 from sqt_jax.members import layout_here

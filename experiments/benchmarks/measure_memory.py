@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.measure import MEGABYTES, Row, member_keys
-from experiments.checkpoints import Checkpoints
 from experiments.running import runtime
+from experiments.running.checkpoints import Checkpoints
 from experiments.running.loop import Position
 from sqt_jax import algorithms, envs, train
 from sqt_jax.config import Config

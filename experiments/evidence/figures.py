@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments import statistics
-from experiments.evidence.collected import Collected, Group, Row, differences, setting_text
+from experiments.evidence import statistics
+from experiments.evidence.cells import NOT_RESAMPLED
 from experiments.evidence.figure_style import (
     COLOURS,
     LINES,
@@ -26,7 +26,7 @@ from experiments.evidence.figure_style import (
     styles,
     wrapped,
 )
-from experiments.evidence.table_parts import NOT_RESAMPLED
+from experiments.evidence.pooling import Collected, Group, Row, differences, setting_text
 
 BAND_RESAMPLES = 1000
 STATISTICS = {"iqm": statistics.iqm, "mean": statistics.mean}
@@ -46,7 +46,7 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
     Args:
       table: the columns of evaluations.csv (`records.read_evaluations`).
     """
-    from experiments.records import groups, of_member, swept_columns  # brings JAX
+    from experiments.running.records import groups, of_member, swept_columns  # brings JAX
 
     figure = Figure(figsize=(11, 4.2), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)

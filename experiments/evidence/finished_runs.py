@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.command_line import UsageError, printable
+from experiments.commandline.arguments import UsageError, printable
 
 REQUIRED = ("member", "env_steps", "gradient_steps", "seed", "return_mean", "q_std")
 
@@ -66,12 +66,12 @@ def _below(path: Path) -> tuple[list[Path], list[Path]]:
 
 def read_run(path: Path) -> list[Curves]:
     """The members of a run that have an evaluation. Raises `UsageError` where its files cannot be understood."""
-    from experiments.running import described  # brings JAX
+    from experiments.running import run_config  # brings JAX
 
     try:
-        run = described.read(path)
+        run = run_config.read(path)
         columns = _read_table(path / "evaluations.csv")
-    except described.NotDescribed as error:
+    except run_config.NotDescribed as error:
         raise UsageError(f"{path}: {error}") from None
     except OSError as error:
         raise UsageError(f"{path}: its evaluations.csv cannot be read ({error.strerror})") from None

@@ -1,4 +1,4 @@
-"""`table_parts.Table` as terminal output, markdown, CSV and LaTeX."""
+"""`cells.Table` as terminal output, markdown, CSV and LaTeX."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.evidence.table_parts import Cell, Table
+from experiments.evidence.cells import Cell, Table
 
 LATEX = {
     "\\": r"\textbackslash{}",

@@ -9,7 +9,7 @@ import re
 import xml.etree.ElementTree as ET
 from xml.etree.ElementTree import Element
 
-from experiments.command_line import printable
+from experiments.commandline.arguments import printable
 
 SVG = "{http://www.w3.org/2000/svg}"
 # Of matplotlib's, and of no use in a page.

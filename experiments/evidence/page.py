@@ -11,10 +11,10 @@ from xml.etree.ElementTree import Element
 from matplotlib.figure import Figure
 
 from experiments.evidence import figures
-from experiments.evidence.collected import Collected
+from experiments.evidence.cells import NOTHING, Cell, Table
 from experiments.evidence.markup import document, element, inline_svg
+from experiments.evidence.pooling import Collected
 from experiments.evidence.run_details import Command, Details
-from experiments.evidence.table_parts import NOTHING, Cell, Table
 
 FOLDER = Path(__file__).parent / "data" / "report"
 LONG = 45  # characters, from which on a cell may be wrapped

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import files
-from experiments.command_line import UsageError
-from experiments.evidence.collected import Collected, setting_text
+from experiments.commandline.arguments import UsageError
+from experiments.evidence.cells import NOTHING, number
 from experiments.evidence.finished_runs import Curves
-from experiments.evidence.table_parts import NOTHING, number
-from experiments.running import described
+from experiments.evidence.pooling import Collected, setting_text
+from experiments.running import files, run_config
 from sqt_jax.algorithms import make_config
 
 MAX_SUMMARY_BYTES = 10_000_000
@@ -76,8 +75,8 @@ def read(path: Path, curves: Sequence[Curves]) -> Details:
       UsageError: its config.json does not describe a run.
     """
     try:
-        run = described.read(path)
-    except described.NotDescribed as error:
+        run = run_config.read(path)
+    except run_config.NotDescribed as error:
         raise UsageError(f"{path}: {error}") from None
     config, content = run.members[0].config, run.content
     status, end = _end(path, bool(content["resumed"]))
@@ -136,9 +135,9 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _changed(run: described.Described) -> list[Setting]:
+def _changed(run: run_config.Described) -> list[Setting]:
     config = run.members[0].config
-    own, default = described.settings_of(run.members, run.swept), make_config(config.algo, config.env).flat()
+    own, default = run_config.settings_of(run.members, run.swept), make_config(config.algo, config.env).flat()
     return [
         Setting(name, setting_text(own[name]), setting_text(value))
         for name, value in default.items()

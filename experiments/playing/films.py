@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import files
+from experiments.running import files
 
 FORMATS = ("mp4", "gif", "html")
 MOST_FRAMES = 60  # a second: screens show no more

@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import files
-from experiments.command_line import UsageError
-from experiments.running import described
-from experiments.running.described import Described, Member
+from experiments.commandline.arguments import UsageError
+from experiments.running import files, run_config
+from experiments.running.run_config import Described, Member
 from sqt_jax.policy import load_policy
 from sqt_jax.types import Array, Environment
 
@@ -25,8 +24,8 @@ class Chosen(NamedTuple):
 def read(path: Path) -> Described:
     """The run in a folder. Raises `UsageError` where there is none."""
     try:
-        return described.read(path)
-    except described.NotDescribed as error:
+        return run_config.read(path)
+    except run_config.NotDescribed as error:
         raise UsageError(f"{path}: takes the folder of a run; {error}") from None
 
 

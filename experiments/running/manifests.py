@@ -14,7 +14,7 @@ import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import files
+from experiments.running import files
 from experiments.running.loop import Position
 
 FORMAT = 3  # another one where the training state, its files or the tables' columns are not what they were

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import psutil
 
-from experiments import records
-from experiments.command_line import UsageError
-from experiments.presets import preset_settings
-from experiments.running import described, flag_table, flags, resume, runtime
-from experiments.running.described import Described, Member
+from experiments.commandline import flag_table, flags
+from experiments.commandline.arguments import UsageError
+from experiments.commandline.presets import preset_settings
+from experiments.running import records, resume, run_config, runtime
+from experiments.running.run_config import Described, Member
 from sqt_jax import envs
 from sqt_jax.algorithms import check_physics, make_config, memory_estimate
 from sqt_jax.config import Config, ConfigError, TrainConfig
@@ -94,15 +94,15 @@ def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Descr
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
         raise UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
-    members, swept = described.make_members(options.seeds, configs), list(options.sweep)
+    members, swept = run_config.make_members(options.seeds, configs), list(options.sweep)
     folder = Path(options.out) / default.env / default.algo
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
         return members, swept, path, None
-    wanted = described.settings_of(members, swept)
+    wanted = run_config.settings_of(members, swept)
     if options.name is None:
         path, run = resume.latest(folder, wanted)
-    elif not _exists(path / described.NAME):
+    elif not _exists(path / run_config.NAME):
         return members, swept, path, None  # so that one command starts a run and goes on with it
     else:
         run = resume.named(path, wanted, options.devices)
@@ -159,7 +159,7 @@ def _default_name(options: flags.Options) -> str:
     changed |= options.settings | options.sweep
     if options.seeds != flag_table.DEFAULT_SEEDS:
         changed["seeds"] = options.seeds
-    return described.default_name(changed, datetime.now(UTC))
+    return run_config.default_name(changed, datetime.now(UTC))
 
 
 def _exists(path: Path) -> bool:

@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import records
-from experiments.command_line import UsageError
-from experiments.running import described, runtime
-from experiments.running.described import Described, Member
+from experiments.commandline.arguments import UsageError
+from experiments.running import records, run_config, runtime
+from experiments.running.run_config import Described, Member
 from sqt_jax.algorithms import check_physics
 from sqt_jax.config import ConfigError, check_train
 
@@ -27,9 +26,9 @@ def named(path: Path, wanted: Mapping[str, Any], devices: int | None = None) -> 
       UsageError: there is no run, or it is another one: the message has the settings that differ.
     """
     try:
-        run = described.read(path)
+        run = run_config.read(path)
         link = records.link_in(path)
-    except described.NotDescribed as error:
+    except run_config.NotDescribed as error:
         raise UsageError(f"--resume={path}: takes the folder of a run; {error}") from None
     except OSError as error:
         raise UsageError(f"--resume={path}: takes a folder that can be read: {error.strerror}") from None
@@ -77,12 +76,12 @@ def with_its_replay(run: Described) -> list[Member]:
 
 def other_versions(run: Described) -> list[str]:
     """Packages whose version is not the run's, as `jax 0.9.0 -> 0.10.2`."""
-    there, here = run.content["versions"], described.versions()
+    there, here = run.content["versions"], run_config.versions()
     return [f"{name} {_text(there.get(name))} -> {here[name]}" for name in here if there.get(name) != here[name]]
 
 
 def _refusal(run: Described, wanted: Mapping[str, Any]) -> str | None:
-    its = described.settings_of(run.members, run.swept)
+    its = run_config.settings_of(run.members, run.swept)
     differing = [
         f"{name} (its own: {_text(its.get(name))}, now: {_text(value)})"
         for name, value in wanted.items()
@@ -92,7 +91,7 @@ def _refusal(run: Described, wanted: Mapping[str, Any]) -> str | None:
         return f"takes the run's own settings; these differ: {', '.join(differing)}"
     if wanted.get("steps", its["steps"]) < its["steps"]:
         return f"takes at least the run's own --steps ({its['steps']:,}), not {wanted['steps']:,}"
-    there, here = str(run.content["versions"].get("sqt_jax")), str(described.versions()["sqt_jax"])
+    there, here = str(run.content["versions"].get("sqt_jax")), str(run_config.versions()["sqt_jax"])
     if there.split(".")[:2] != here.split(".")[:2]:
         return f"takes a run of sqt_jax {'.'.join(here.split('.')[:2])}, not {there[:20]}"
     return None

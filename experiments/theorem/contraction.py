@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.theorem.tabular_agents import Rule, Target
+from experiments.theorem.q_learning import Rule, Target
 from sqt_jax.types import Array
 
 PAIRS = 100_000

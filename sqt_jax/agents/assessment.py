@@ -10,8 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sqt_jax.conditional import rarely
 from sqt_jax.config import AgentConfig
-from sqt_jax.rarely import rarely
 from sqt_jax.types import Array, Metrics, Params
 
 # The smallest return of no episodes: finite, so that what is not finite in an agent's state tells of divergence.

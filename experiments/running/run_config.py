@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from experiments import files
-from experiments.running.flags import MAX_MEMBERS
+from experiments.commandline.flags import MAX_MEMBERS
+from experiments.running import files
 from sqt_jax import envs
 from sqt_jax.algorithms import eval_physics_of, make_config
 from sqt_jax.config import Config, ConfigError

@@ -4,8 +4,8 @@ from made_curves import curves
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from experiments.theorem.tabular_figure import STYLES, _draw, _dress, draw
-from experiments.theorem.tabular_report import interval
+from experiments.theorem.claims import interval
+from experiments.theorem.value_figure import STYLES, _draw, _dress, draw
 
 
 def test_an_algorithm_has_its_colour_and_an_mdp_its_column(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.theorem import contraction
-from experiments.theorem.tabular_agents import Algorithm, Record
+from experiments.theorem.q_learning import Algorithm, Record
 
 ROUNDING = 1e-4  # what float32 may add to a ratio, or put between two programs of the same arithmetic
 GAPS = (0.1, 0.01, 0.001)

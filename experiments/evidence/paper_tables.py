@@ -10,20 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments import statistics
-from experiments.evidence import published
-from experiments.evidence.collected import (
-    PROTOCOL,
-    Collected,
-    Group,
-    Row,
-    base_algorithm,
-    row_differences,
-    setting_text,
-)
-from experiments.evidence.published import PAPERS_TASKS, Published
-from experiments.evidence.table_comparisons import forms_compared, has_penalty, versus_base
-from experiments.evidence.table_parts import (
+from experiments.evidence import published, statistics
+from experiments.evidence.cells import (
     NOT_RESAMPLED,
     NOTHING,
     Cell,
@@ -35,6 +23,17 @@ from experiments.evidence.table_parts import (
     joined,
     number,
 )
+from experiments.evidence.comparisons import forms_compared, has_penalty, versus_base
+from experiments.evidence.pooling import (
+    PROTOCOL,
+    Collected,
+    Group,
+    Row,
+    base_algorithm,
+    row_differences,
+    setting_text,
+)
+from experiments.evidence.published import PAPERS_TASKS, Published
 
 NAMES = ("table1", "table2", "table2_improvement", "table3", "table3_change", "table4", "seeds")
 

@@ -5,10 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import statistics
-from experiments.evidence import published
-from experiments.evidence.collected import PENALTY, Collected, Group, Row, base_algorithm, differing
-from experiments.evidence.table_parts import (
+from experiments.evidence import published, statistics
+from experiments.evidence.cells import (
     NOT_RESAMPLED,
     NOTHING,
     Cell,
@@ -20,6 +18,7 @@ from experiments.evidence.table_parts import (
     joined,
     number,
 )
+from experiments.evidence.pooling import PENALTY, Collected, Group, Row, base_algorithm, differing
 
 
 class Comparison(NamedTuple):

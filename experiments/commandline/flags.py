@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 from absl import flags as absl_flags
 
-from experiments.command_line import UsageError
-from experiments.presets import PRESETS
-from experiments.running import config_file
-from experiments.running.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag
+from experiments.commandline import config_file
+from experiments.commandline.arguments import UsageError
+from experiments.commandline.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag
+from experiments.commandline.presets import PRESETS
 from sqt_jax.config import ConfigError, check_value
 from sqt_jax.names import nearest
 from sqt_jax.types import Scalars

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sqt_jax.rarely import rarely
+from sqt_jax.conditional import rarely
 
 
 def branch(old, given):

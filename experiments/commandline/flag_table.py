@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from experiments.presets import PRESETS
+from experiments.commandline.presets import PRESETS
 from sqt_jax.config import SALE_SETTINGS, TD7_SETTINGS, AgentConfig, Config, TrainConfig
 from sqt_jax.types import Scalars
 

@@ -6,8 +6,8 @@ from itertools import product
 
 import pytest
 
-from experiments.running import described
-from experiments.running.described import default_name
+from experiments.running import run_config
+from experiments.running.run_config import default_name
 from sqt_jax.algorithms import make_config
 
 OUTPUT = {"tensorboard": True, "checkpoint_every": 20, "keep_checkpoints": 2}
@@ -29,7 +29,7 @@ def members_of(algo="sac_sqt", seeds=(3, 1), sweep=None, **settings):
         make_config(algo, "ant", **small | settings | dict(zip(sweep, values, strict=True)))
         for values in product(*sweep.values())
     ]
-    return described.make_members(seeds, configs), list(sweep)
+    return run_config.make_members(seeds, configs), list(sweep)
 
 
 RUNS = {
@@ -44,15 +44,15 @@ RUNS = {
 
 def written(path, run):
     members, swept = members_of(**RUNS[run])
-    content = described.describe(members, swept, ["run", "--x"], "paper", OUTPUT)
-    described.write(path, content)
+    content = run_config.describe(members, swept, ["run", "--x"], "paper", OUTPUT)
+    run_config.write(path, content)
     return members, swept, content
 
 
 @pytest.mark.parametrize("run", RUNS)
 def test_a_run_is_read_back_as_it_was_described(tmp_path, run):
     members, swept, content = written(tmp_path, run)
-    assert described.read(tmp_path) == described.Described(members, swept, json.loads(json.dumps(content)))
+    assert run_config.read(tmp_path) == run_config.Described(members, swept, json.loads(json.dumps(content)))
     assert [item.name for item in tmp_path.iterdir()] == ["config.json"]
 
 
@@ -64,7 +64,7 @@ def test_seeds_vary_fastest():
 
 def test_settings_of_a_run_have_what_is_swept_as_values():
     members, swept = members_of(seeds=(3, 1), sweep={"lr": (0.1, 0.2), "tau": (0.5, 0.25)})
-    settings = described.settings_of(members, swept)
+    settings = run_config.settings_of(members, swept)
     assert (settings["seeds"], settings["lr"], settings["tau"]) == ((3, 1), (0.1, 0.2), (0.5, 0.25))
     assert settings.keys() == members[0].config.flat().keys() | {"seeds"}
     assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)
@@ -73,19 +73,19 @@ def test_settings_of_a_run_have_what_is_swept_as_values():
 def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
     members, swept, content = written(tmp_path, "plain")
     output = content["output"] | {"keep_checkpoints": 5}
-    again = described.resumed(content, 100, content["output"], 40, ["run", "--resume=x"])
-    again = described.resumed(again, 100, output, 60, ["run", "--resume=y"])
+    again = run_config.resumed(content, 100, content["output"], 40, ["run", "--resume=x"])
+    again = run_config.resumed(again, 100, output, 60, ["run", "--resume=y"])
     assert again["settings"] == content["settings"] | {"steps": 100} and content["resumed"] == []
     assert [(entry["env_steps"], entry["command"][1]) for entry in again["resumed"]] == [
         (40, "--resume=x"),
         (60, "--resume=y"),
     ]
-    assert all(entry["versions"] == described.versions() and entry["at"] for entry in again["resumed"])
+    assert all(entry["versions"] == run_config.versions() and entry["at"] for entry in again["resumed"])
     assert again["output"] == output
     for unchanged in content.keys() - {"settings", "resumed", "output"}:
         assert again[unchanged] == content[unchanged]
-    described.write(tmp_path, again)
-    read = described.read(tmp_path)
+    run_config.write(tmp_path, again)
+    read = run_config.read(tmp_path)
     assert {member.config.train.steps for member in read.members} == {100} and read.content["replay_rows"] == 60
 
 
@@ -114,14 +114,14 @@ def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
 )
 def test_what_describes_no_run_is_refused(tmp_path, change, message):
     _, _, content = written(tmp_path, "swept")
-    described.write(tmp_path, content | change)
-    with pytest.raises(described.NotDescribed, match=message) as error:
-        described.read(tmp_path)
+    run_config.write(tmp_path, content | change)
+    with pytest.raises(run_config.NotDescribed, match=message) as error:
+        run_config.read(tmp_path)
     assert len(str(error.value)) < 500
 
 
 def test_what_json_has_no_word_for_is_not_written(tmp_path):
     _, _, content = written(tmp_path, "plain")
     with pytest.raises(ValueError):
-        described.write(tmp_path, content | {"lr": float("nan")})
-    assert described.read(tmp_path).content["preset"] == "paper"
+        run_config.write(tmp_path, content | {"lr": float("nan")})
+    assert run_config.read(tmp_path).content["preset"] == "paper"

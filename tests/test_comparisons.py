@@ -2,9 +2,9 @@ import pytest
 from made_runs import write_run
 from table_reader import cells
 
-from experiments.evidence.collected import collect
-from experiments.evidence.table_comparisons import versus_base
-from experiments.evidence.table_parts import NOT_RESAMPLED
+from experiments.evidence.cells import NOT_RESAMPLED
+from experiments.evidence.comparisons import versus_base
+from experiments.evidence.pooling import collect
 
 
 def test_improvement_by_hand(tmp_path):

@@ -2,8 +2,8 @@ import argparse
 
 import pytest
 
-from experiments import command_line
-from experiments.command_line import Parser, UsageError, between, folder, guarded, one_of, refuse_file, whole
+from experiments.commandline import arguments
+from experiments.commandline.arguments import Parser, UsageError, between, folder, guarded, one_of, refuse_file, whole
 
 
 @pytest.fixture
@@ -60,12 +60,12 @@ def test_exit_codes(parser, capsys):
 
 def test_files_are_replaced_only_where_that_is_asked_for(tmp_path):
     out = tmp_path / "new" / "tables"
-    command_line.refuse_existing(out, ["a.csv"], overwrite=False)
-    command_line.write_files(out, {"a.csv": b"1"})
+    arguments.refuse_existing(out, ["a.csv"], overwrite=False)
+    arguments.write_files(out, {"a.csv": b"1"})
     with pytest.raises(UsageError, match="a.csv is there already; takes another folder, or --overwrite replaces it"):
-        command_line.refuse_existing(out, ["b.csv", "a.csv"], overwrite=False)
-    command_line.refuse_existing(out, ["a.csv"], overwrite=True)
-    command_line.write_files(out, {"a.csv": b"2"})
+        arguments.refuse_existing(out, ["b.csv", "a.csv"], overwrite=False)
+    arguments.refuse_existing(out, ["a.csv"], overwrite=True)
+    arguments.write_files(out, {"a.csv": b"2"})
     assert [(path.name, path.read_bytes()) for path in out.iterdir()] == [("a.csv", b"2")]
 
 
@@ -73,44 +73,44 @@ def test_folders_that_cannot_be_written(tmp_path):
     file = tmp_path / "file"
     file.write_text("x")
     with pytest.raises(UsageError, match="takes a folder, which this is not"):
-        command_line.refuse_existing(file, ["a.csv"], overwrite=True)
+        arguments.refuse_existing(file, ["a.csv"], overwrite=True)
     for out in (file / "below", file / "below" / "further", tmp_path / ("x" * 300)):
         with pytest.raises(UsageError, match="^--out=.*: takes a folder that can be written"):
-            command_line.refuse_existing(out, ["a.csv"], overwrite=True)
+            arguments.refuse_existing(out, ["a.csv"], overwrite=True)
         with pytest.raises(UsageError, match="^--out=.*: takes a folder that can be written"):
-            command_line.write_files(out, {"a.csv": b""})
+            arguments.write_files(out, {"a.csv": b""})
     (tmp_path / "a.csv").mkdir()
     with pytest.raises(UsageError, match="a.csv is a folder"):
-        command_line.refuse_existing(tmp_path, ["a.csv"], overwrite=True)
+        arguments.refuse_existing(tmp_path, ["a.csv"], overwrite=True)
 
 
 def test_a_link_is_replaced_and_not_written_through(tmp_path):
     (tmp_path / "precious").write_text("x")
     (tmp_path / "a.csv").symlink_to(tmp_path / "precious")
     with pytest.raises(UsageError):
-        command_line.refuse_existing(tmp_path, ["a.csv"], overwrite=False)
-    command_line.write_files(tmp_path, {"a.csv": b"1"})
+        arguments.refuse_existing(tmp_path, ["a.csv"], overwrite=False)
+    arguments.write_files(tmp_path, {"a.csv": b"1"})
     assert (tmp_path / "precious").read_text() == "x" and not (tmp_path / "a.csv").is_symlink()
 
 
 def test_one_file_is_written_whole(tmp_path):
     out = tmp_path / "new" / "report.html"
     for content in (b"1", b"2"):
-        command_line.write_file(out, content)
+        arguments.write_file(out, content)
         assert out.read_bytes() == content and [*out.parent.iterdir()] == [out]
     for path in (tmp_path, out / "below.html", tmp_path / ("x" * 300)):
         with pytest.raises(UsageError, match="--out=.*: takes a file"):
-            command_line.write_file(path, b"")
+            arguments.write_file(path, b"")
 
 
 @pytest.mark.parametrize("text", ["", ".", "/", "folder/", "a\0b"])
 def test_what_can_be_no_file(text):
     with pytest.raises(argparse.ArgumentTypeError, match="takes a file"):
-        command_line.file(text)
+        arguments.file(text)
 
 
 def test_what_is_not_to_be_seen_is_escaped():
-    assert command_line.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"
+    assert arguments.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"
 
 
 def test_a_command_for_one_run_takes_one():

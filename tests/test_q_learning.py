@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.theorem import contraction, mdps
-from experiments.theorem import tabular_agents as ta
+from experiments.theorem import q_learning as ta
 
 GAMMA = 0.5
 # Two tables' values of the next state: U prefers action 0, V action 1.

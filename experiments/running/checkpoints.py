@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import files
-from experiments.running import manifests
+from experiments.running import files, manifests
 from experiments.running.loop import Position
 from experiments.running.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
 from sqt_jax.members import Layout, member_axes

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import statistics
-from experiments.command_line import UsageError
+from experiments.commandline.arguments import UsageError
+from experiments.evidence import statistics
 from experiments.evidence.finished_runs import Curves, find, read_run
 
 # In these alone do an algorithm with SQT and its base differ, where they can be compared.

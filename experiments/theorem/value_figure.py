@@ -13,7 +13,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from experiments.evidence.figure_style import COLOURS
 from experiments.theorem import mdps
-from experiments.theorem.tabular_report import Curves, Names, collapsed, interval
+from experiments.theorem.claims import Curves, Names, collapsed, interval
 
 STYLES = {  # colour, line, label
     "q_learning": (COLOURS[0], "-", "Q-learning"),

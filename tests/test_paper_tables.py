@@ -1,9 +1,9 @@
 from made_runs import write_run
 from table_reader import cells
 
-from experiments.evidence import published, tabulated
-from experiments.evidence.collected import collect
-from experiments.evidence.tabulated import make_tables, table_1, table_2, table_3, table_4
+from experiments.evidence import paper_tables, published
+from experiments.evidence.paper_tables import make_tables, table_1, table_2, table_3, table_4
+from experiments.evidence.pooling import collect
 
 NAN = float("nan")
 
@@ -18,7 +18,8 @@ def test_table_1_by_hand():
 
 def test_the_sizes_are_the_environments(tmp_path):
     write_run(tmp_path, env="hopper")
-    sizes = {row["env"]: (row["observation"], row["action"]) for row in tabulated.task_sizes(collect([str(tmp_path)]))}
+    runs = collect([str(tmp_path)])
+    sizes = {row["env"]: (row["observation"], row["action"]) for row in paper_tables.task_sizes(runs)}
     theirs = {env: tuple(size) for env, size in published.paper()["table1_obs_action"].items()}
     assert sizes == theirs | {"hopper": (11, 3)}
 
@@ -147,7 +148,7 @@ def test_nothing_published_is_said(tmp_path):
 
 def test_seeds_by_hand(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 4, 9], [0, 6, NAN]], seeds=[3, 5], q_std=[0.5, 0.75])
-    table = tabulated.seeds_table(collect([str(tmp_path)]))
+    table = paper_tables.seeds_table(collect([str(tmp_path)]))
     assert cells(table) == [["td3 [1]", "cheetah", "3: 4.00  5: 6.00", "3: 9.00  5: -", "3: 0.50  5: 0.75"]]
     first, second = table.records
     assert (first["seed"], first["return_at_score"], first["best_return"], first["best_env_steps"]) == (3, 4, 9, 100)

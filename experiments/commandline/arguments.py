@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from experiments import files
+from experiments.running import files
 
 DONE, BAD_USAGE = 0, 2
 

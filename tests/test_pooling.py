@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from made_runs import write_run
 
-from experiments.command_line import UsageError
-from experiments.evidence.collected import base_algorithm, collect, row_differences
+from experiments.commandline.arguments import UsageError
+from experiments.evidence.pooling import base_algorithm, collect, row_differences
 from sqt_jax.algorithms import ALGORITHMS
 
 NAN = float("nan")

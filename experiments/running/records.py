@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments import files
-from experiments.csv_table import Shortened, Table
-from experiments.running.described import Member
+from experiments.evidence.statistics import iqm, score
+from experiments.running import files
+from experiments.running.csv_rows import Shortened, Table
 from experiments.running.events import Events
 from experiments.running.loop import Outcome, Report
-from experiments.statistics import iqm, score
+from experiments.running.run_config import Member
 from sqt_jax import bias
 
 # The columns that every evaluations.csv has; further swept scalars follow.

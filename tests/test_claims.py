@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from made_curves import curves
 
-from experiments.theorem import tabular_agents
-from experiments.theorem import tabular_report as report
+from experiments.theorem import claims as report
+from experiments.theorem import q_learning
 
 
 def test_a_verdict_needs_all_rows_and_their_intervals():
@@ -50,7 +50,7 @@ def test_statements_follow_from_the_numbers():
 
 
 def test_eq_16_is_contradicted_by_a_penalty_only():
-    sqt = tabular_agents.algorithms()["sqt"]
+    sqt = q_learning.algorithms()["sqt"]
     for coef, verdict in ((0.0, "supported"), (0.5, "contradicted")):
         found = report.expansions(sqt, [coef], 1, 2000)
         statement = report.non_expansion(found, 4, 0.8, 1, 2000)

@@ -1,6 +1,6 @@
 import pytest
 
-from experiments.evidence.table_parts import Notes, finite, interval, joined, number
+from experiments.evidence.cells import Notes, finite, interval, joined, number
 
 NAN = float("nan")
 
