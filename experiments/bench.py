@@ -67,7 +67,7 @@ NAMED: dict[str, dict[str, Any]] = {
 FLAGS = flags.FLAGS
 flags.DEFINE_list("suites", list(SUITES), f"What to measure: {', '.join(SUITES + MORE_SUITES)}.")
 flags.DEFINE_enum("suite", None, list(NAMED), "Flags by name, which those that are given win over.")
-flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks; the suite replay takes the rows of the first one.")
+flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks; the suite replay expects the rows of the first one.")
 flags.DEFINE_list("physics", None, "Physics of the suites env, loop and memory; by itself all that can run here.")
 flags.DEFINE_list("solver", [], "Further limits of MJX's solver in the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop and memory.")
@@ -94,7 +94,7 @@ def check_flags() -> None:
             FLAGS[name].value = value
     for name in ("tasks", "algos", "members", "devices", "capacities", "physics"):
         if FLAGS[name].value == []:  # of the suites alone none may be asked for, beside --compare
-            sys.exit(f"--{name}: takes at least one")
+            sys.exit(f"--{name}: expects at least one")
     known = {
         "suites": SUITES + MORE_SUITES,
         "compare": compare.NEEDS,
@@ -105,22 +105,22 @@ def check_flags() -> None:
     for name, values in known.items():
         for value in getattr(FLAGS, name) or ():
             if value not in values:
-                sys.exit(f"--{name}: takes some of {', '.join(values)}, not {value!r}")
+                sys.exit(f"--{name}: expects some of {', '.join(values)}, not {value!r}")
     for name in ("members", "devices", "capacities"):
         for value in getattr(FLAGS, name):
             if not (value.isdecimal() and int(value)) and (name, value) != ("devices", "auto"):
-                sys.exit(f"--{name}: takes whole numbers of at least 1, not {value!r}")
+                sys.exit(f"--{name}: expects whole numbers of at least 1, not {value!r}")
     solver_limits()
     if "growth" in FLAGS.suites and len(FLAGS.members) != 1:
-        sys.exit(f"--members: takes one number where growth is measured, not {','.join(FLAGS.members)}")
+        sys.exit(f"--members: expects one number where growth is measured, not {','.join(FLAGS.members)}")
     if FLAGS.json and (Path(FLAGS.json).is_dir() or not Path(FLAGS.json).absolute().parent.is_dir()):
-        sys.exit(f"--json: takes a file in a folder that is there, not {FLAGS.json!r}")
+        sys.exit(f"--json: expects a file in a folder that is there, not {FLAGS.json!r}")
     if "growth" in FLAGS.suites:
         with leaving():
             arguments.refuse_folder("--figures", Path(FLAGS.figures))
     for peer in FLAGS.compare:
         if not {*compare.ALGORITHMS[peer]} & {*FLAGS.algos}:
-            sys.exit(f"--algos: takes some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
+            sys.exit(f"--algos: expects some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
         if compare.lacks(peer, FLAGS.peer_python):
             sys.exit(f"--compare: {peer} needs a Python with {compare.INSTALL[peer]}; --peer_python names it")
 
@@ -140,7 +140,7 @@ def solver_limits() -> dict[str, dict[str, int]]:
     for value in FLAGS.solver:
         numbers = value.split("/")
         if len(numbers) != 2 or not all(number.isdecimal() and int(number) for number in numbers):
-            sys.exit(f"--solver: takes pairs of whole numbers of at least 1 as in 8/8, not {value!r}")
+            sys.exit(f"--solver: expects pairs of whole numbers of at least 1 as in 8/8, not {value!r}")
         found[value] = dict(zip(("iterations", "ls_iterations"), map(int, numbers), strict=True))
     return found
 
@@ -158,7 +158,7 @@ def devices_here() -> list[int | None]:
     here = len(jax.local_devices())
     counts = [None if value == "auto" else int(value) for value in FLAGS.devices]
     if most := max((count for count in counts if count and count > here), default=None):
-        sys.exit(f"--devices: takes at most {here} here, not {most}")
+        sys.exit(f"--devices: expects at most {here} here, not {most}")
     return counts
 
 
@@ -292,7 +292,7 @@ def save(found: Sequence[Row], failed: Sequence[Failure], peak: float) -> None:
         with files.whole_file(Path(FLAGS.json)) as file:
             file.write((json.dumps(report, indent=1) + "\n").encode())
     except OSError as error:
-        sys.exit(f"--json={FLAGS.json}: takes a file that can be written: {error.strerror}")
+        sys.exit(f"--json={FLAGS.json}: expects a file that can be written: {error.strerror}")
 
 
 def show(found: Sequence[Row], peak: float) -> None:
@@ -307,7 +307,7 @@ def show(found: Sequence[Row], peak: float) -> None:
         for path in growth.draw(found, Path(FLAGS.figures)):
             print(path)
     except OSError as error:
-        sys.exit(f"--figures={FLAGS.figures}: takes a folder that can be written: {error.strerror}")
+        sys.exit(f"--figures={FLAGS.figures}: expects a folder that can be written: {error.strerror}")
 
 
 def main(argv: Sequence[str]) -> None:

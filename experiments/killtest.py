@@ -251,7 +251,7 @@ def main(argv: Sequence[str]) -> None:
     for name, known in (("tasks", TASKS), ("algos", ALGORITHMS)):
         for value in getattr(FLAGS, name):
             if value not in known:
-                sys.exit(f"--{name}: takes some of {', '.join(known)}, not {value!r}")
+                sys.exit(f"--{name}: expects some of {', '.join(known)}, not {value!r}")
     began, failures, done = time.monotonic(), 0, 0
     with tempfile.TemporaryDirectory() as parent, ThreadPoolExecutor(FLAGS.jobs) as pool:
         cases = [(task, algo) for task in FLAGS.tasks for algo in FLAGS.algos]

@@ -201,7 +201,7 @@ def refuse_others() -> None:
     """Leaves with one line where a flag was given that the benchmark alone has a use for."""
     for flag in FLAGS.flags_by_module_dict()[bench.__name__]:
         if flag.present and flag.name not in TAKEN:
-            sys.exit(f"--{flag.name}: has no effect here; takes of the benchmark's flags --{', --'.join(TAKEN)}")
+            sys.exit(f"--{flag.name}: has no effect here; expects of the benchmark's flags --{', --'.join(TAKEN)}")
 
 
 def main(argv: Sequence[str]) -> None:

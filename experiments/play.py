@@ -38,7 +38,7 @@ SIZE = (640, 480)
 
 
 class Task(NamedTuple):
-    """An environment to play in, and what showing it takes."""
+    """An environment to play in, and what showing it expects."""
 
     env: "Environment"
     physics: str
@@ -51,10 +51,10 @@ def size(text: str) -> tuple[int, int]:
     """The type of --size. Even numbers, as video formats want them."""
     numbers = text.lower().split("x")
     if len(numbers) != 2 or not all(n.isascii() and n.isdecimal() and len(n) < 6 for n in numbers):
-        raise argparse.ArgumentTypeError(f"takes WIDTHxHEIGHT, not {text[:50]!r}")
+        raise argparse.ArgumentTypeError(f"expects WIDTHxHEIGHT, not {text[:50]!r}")
     width, height = map(int, numbers)
     if not all(16 <= n <= 4096 and n % 2 == 0 for n in (width, height)):
-        raise argparse.ArgumentTypeError(f"takes even numbers from 16 to 4096, not {text!r}")
+        raise argparse.ArgumentTypeError(f"expects even numbers from 16 to 4096, not {text!r}")
     return width, height
 
 
@@ -62,7 +62,7 @@ def film(text: str) -> Path:
     """The type of --video."""
     try:
         if "\0" in text:
-            raise ValueError("takes a file")
+            raise ValueError("expects a file")
         films.format_of(Path(text))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{error}, not {text[:200]!r}") from None
@@ -141,9 +141,9 @@ def _prepare(path: Path, options: argparse.Namespace) -> None:
     name = _env_name(path)
     if name.startswith(BRAX):
         if films.format_of(options.video) != "html":
-            raise UsageError(f"--video={options.video}: takes a file with the ending .html, as {name} is Brax's")
+            raise UsageError(f"--video={options.video}: expects a file with the ending .html, as {name} is Brax's")
         if options.size:
-            raise UsageError(f"--size: Brax's viewer has its own; takes no size with {name}")
+            raise UsageError(f"--size: Brax's viewer has its own; expects no size with {name}")
         return
     try:
         os.environ["MUJOCO_GL"] = graphics.choose()
@@ -168,12 +168,14 @@ def _task(config: Any, options: argparse.Namespace) -> Task:
     brax = config.env.startswith(BRAX)
     physics = options.physics or (config.physics if brax else "mujoco")
     if physics not in envs.simulators(config.env):
-        raise UsageError(f"--physics={physics}: takes one of {', '.join(envs.simulators(config.env))}")
+        raise UsageError(f"--physics={physics}: expects one of {', '.join(envs.simulators(config.env))}")
     if missing := envs.lacks(physics):
         raise UsageError(f"--physics={physics}: needs {missing}")
     if brax:
         if options.camera:
-            raise UsageError(f"--camera={options.camera}: Brax's viewer has its own; takes no camera with {config.env}")
+            raise UsageError(
+                f"--camera={options.camera}: Brax's viewer has its own; expects no camera with {config.env}"
+            )
         own = brax_envs.brax_own(config.env, physics)
         return Task(envs.make(config.env, physics), physics, float(own.dt), brax_pages.poses, own)
     row = envs.TASKS[config.env]
@@ -223,7 +225,7 @@ def _film(
             pictures = _counted(rendering.frames(task.scene, shown, (width, height), options.camera), done)
             written = films.write(path, pictures, every * task.period, caption)
     except OSError as error:
-        raise UsageError(f"--video={path}: takes a file that can be written: {error.strerror or error}") from None
+        raise UsageError(f"--video={path}: expects a file that can be written: {error.strerror or error}") from None
     of = "every state" if every == 1 else f"one state in {every}"
     rate = 1 / (every * task.period)
     print(f"{path}: {width}x{height}, {len(shown):,} pictures, {rate:.4g} per second ({of}), {written / 1e6:,.2f} MB")

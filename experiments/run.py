@@ -101,14 +101,14 @@ def _lock(plan: "Plan", stack: ExitStack) -> None:
         stack.enter_context(files.locked(plan.path))
     except files.Busy as busy:
         flag = f"--resume={plan.path}" if plan.resumed else f"--name={plan.path.name}"
-        raise UsageError(f"{flag}: process {busy.process} is at work on {plan.path}; takes another run") from None
+        raise UsageError(f"{flag}: process {busy.process} is at work on {plan.path}; expects another run") from None
     except OSError as error:
         raise _cannot_write(plan, error) from None
 
 
 def _cannot_write(plan: "Plan", error: OSError) -> UsageError:
     flag = f"--resume={plan.path}" if plan.resumed else f"--out={plan.options.out}"
-    return UsageError(f"{flag}: takes a folder that can be written: {error}")
+    return UsageError(f"{flag}: expects a folder that can be written: {error}")
 
 
 def _start(plan: "Plan") -> tuple[Array, Scalars]:
@@ -128,7 +128,7 @@ def _restored(plan: "Plan", store: "Checkpoints", template: TrainState) -> "Rest
     try:
         restored = store.restore(template)
     except manifests.Refused as error:
-        raise UsageError(f"--resume={plan.path}: takes a run with checkpoints to go on from; {error}") from None
+        raise UsageError(f"--resume={plan.path}: expects a run with checkpoints to go on from; {error}") from None
     if restored is None:
         _refuse_to_begin_again(plan.path, plan.resumed.content["output"].get("checkpoint_every"))
     return restored
@@ -136,7 +136,7 @@ def _restored(plan: "Plan", store: "Checkpoints", template: TrainState) -> "Rest
 
 def _refuse_to_begin_again(path: Path, checkpoint_every: object) -> None:
     """Where there is more to lose than what a run writes before its first checkpoint, and would write again."""
-    refusal = f"--resume={path}: takes a run with checkpoints to go on from; it has none"
+    refusal = f"--resume={path}: expects a run with checkpoints to go on from; it has none"
     if checkpoint_every == 0 or (path / "summary.json").exists():
         raise UsageError(refusal)
     # The first checkpoint is on disk when the second one is due.
@@ -207,10 +207,10 @@ def _tables(plan: "Plan", restored: "Restored | None", warn: Callable[[str], Non
         return records.Records(plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, warn)
     except csv_rows.Shortened as error:
         raise UsageError(
-            f"--resume={plan.path}: {error} has lost rows since the checkpoint; takes a run with whole tables"
+            f"--resume={plan.path}: {error} has lost rows since the checkpoint; expects a run with whole tables"
         ) from None
     except csv_rows.OtherColumns as error:
-        raise UsageError(f"--resume={plan.path}: takes a run of this version; {error} has other columns") from None
+        raise UsageError(f"--resume={plan.path}: expects a run of this version; {error} has other columns") from None
     except OSError as error:
         raise _cannot_write(plan, error) from None
 

@@ -168,7 +168,7 @@ def main(argv: Sequence[str]) -> int:
     from sqt_jax.algorithms import ALGORITHMS
 
     if FLAGS.preset is None:
-        return refuse(f"--preset: takes one of {', '.join(PRESETS)}")
+        return refuse(f"--preset: expects one of {', '.join(PRESETS)}")
     if FLAGS.preset not in PRESETS:
         return refuse(f"--preset: {unknown(str(FLAGS.preset), PRESETS)}")
     for algo in FLAGS.algos:
@@ -182,7 +182,7 @@ def main(argv: Sequence[str]) -> int:
     for word in argv[1:]:
         if not word.startswith("--") or word.lstrip("-").split("=")[0] in own:
             return refuse(
-                f"{word}: takes flags of experiments.run in the form --flag=value, but for --{', --'.join(own)}"
+                f"{word}: expects flags of experiments.run in the form --flag=value, but for --{', --'.join(own)}"
             )
     grid = cells(PRESETS[FLAGS.preset], FLAGS.algos, tasks, Path(FLAGS.out), argv[1:])
     return sweep(grid, run_in_a_process, lambda line: print(line, flush=True))

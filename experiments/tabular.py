@@ -91,8 +91,8 @@ def parse(argv: Sequence[str]) -> dict[str, Any]:
         if not found or found[1] not in values:
             raise UsageError(str(error).splitlines()[0]) from None
         wrong = values[found[1]]
-        takes = wrong.parser.syntactic_help or ("true or false" if wrong.boolean else "a word")
-        raise UsageError(f"--{found[1]}: takes {takes}") from None
+        expects = wrong.parser.syntactic_help or ("true or false" if wrong.boolean else "a word")
+        raise UsageError(f"--{found[1]}: expects {expects}") from None
     if rest:
         raise UsageError(f"{rest[0]}: unexpected argument; settings are given as --flag=value")
     flag: dict[str, Any] = {name: values[name].value for name in values}
@@ -109,23 +109,23 @@ def parse(argv: Sequence[str]) -> dict[str, Any]:
     flag["coefs"] = coefs
     for name in ("gamma", "lr_power", "epsilon", "init_std", "weighted_c"):
         if not math.isfinite(flag[name]):
-            raise UsageError(f"--{name}: takes a number, not {flag[name]}")
+            raise UsageError(f"--{name}: expects a number, not {flag[name]}")
     if not 0 < flag["gamma"] < 1:  # the ratios of eq. 16 are divided by it
-        raise UsageError(f"--gamma: takes a number above 0 and below 1, not {flag['gamma']:g}")
+        raise UsageError(f"--gamma: expects a number above 0 and below 1, not {flag['gamma']:g}")
     if flag["lr_power"] <= 0.5:
-        raise UsageError(f"--lr_power: takes a number above 0.5 and up to 1, not {flag['lr_power']:g}")
+        raise UsageError(f"--lr_power: expects a number above 0.5 and up to 1, not {flag['lr_power']:g}")
     if flag["weighted_c"] == 0:
-        raise UsageError("--weighted_c: takes a number above 0, not 0")
+        raise UsageError("--weighted_c: expects a number above 0, not 0")
     _check_out(flag["out"], flag["overwrite"])
     return flag
 
 
 def _check_list(name: str, words: Sequence) -> None:
     if not words:
-        raise UsageError(f"--{name}: takes at least one")
+        raise UsageError(f"--{name}: expects at least one")
     for word in words:
         if words.count(word) > 1:
-            raise UsageError(f"--{name}: takes each value once, {word} is there {words.count(word)} times")
+            raise UsageError(f"--{name}: expects each value once, {word} is there {words.count(word)} times")
 
 
 def _coefficient(word: str) -> float:
@@ -134,20 +134,20 @@ def _coefficient(word: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 <= value < math.inf:
-        raise UsageError(f"--coefs: takes numbers of at least 0 like 0,0.5, not {word!r}")
+        raise UsageError(f"--coefs: expects numbers of at least 0 like 0,0.5, not {word!r}")
     return value
 
 
 def _check_out(name: str, overwrite: bool) -> None:
     path = Path(name)
     if not name or "\0" in name:
-        raise UsageError("--out: takes a folder")
+        raise UsageError("--out: expects a folder")
     arguments.refuse_folder("--out", path)
     try:
         if not overwrite and path.exists() and any(path.iterdir()):
-            raise UsageError(f"--out={name}: is there already; takes another folder, or --overwrite beside it")
+            raise UsageError(f"--out={name}: is there already; expects another folder, or --overwrite beside it")
     except OSError as error:
-        raise UsageError(f"--out={name}: takes a folder that can be read: {error.strerror}") from None
+        raise UsageError(f"--out={name}: expects a folder that can be read: {error.strerror}") from None
     arguments.refuse_existing(path, (TABLE, FIGURE), overwrite)
 
 

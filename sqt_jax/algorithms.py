@@ -106,7 +106,7 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
     """An agent's checked settings: the defaults, then the algorithm's row, then `settings`.
 
     Raises:
-      ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
+      ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it expects.
     """
     if algo not in ALGORITHMS:
         raise ConfigError("algo", unknown(algo, ALGORITHMS))
@@ -117,10 +117,10 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
     config = AgentConfig(**row.settings | settings)
     own_penalty = row.settings.get("penalty", AgentConfig.penalty)
     if config.penalty != own_penalty:
-        raise ConfigError("penalty", f"takes {own_penalty} for {algo}: the algorithm's name says it")
+        raise ConfigError("penalty", f"expects {own_penalty} for {algo}: the algorithm's name says it")
     check_agent(algo, config)
     if row.assessed and config.networks != "sale":
-        raise ConfigError("networks", f"takes sale for {algo}")
+        raise ConfigError("networks", f"expects sale for {algo}")
     for ignored, cause in ((row.ignores, algo), (IGNORED_WITH[config.networks], f"--networks={config.networks}")):
         for name in settings:
             # The default may be named: config.json names everything.
@@ -138,7 +138,7 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
       **settings: fields of `AgentConfig` and `TrainConfig` by name, `physics` and `eval_physics`.
 
     Raises:
-      ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it takes.
+      ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it expects.
     """
     physics, eval_physics = settings.pop("physics", None), settings.pop("eval_physics", "auto")
     training = {name: settings.pop(name) for name in TRAIN_SETTINGS & settings.keys()}
@@ -158,7 +158,7 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     train_config = TrainConfig(**{**ALGORITHMS[algo].training, **training})
     check_train(train_config)
     if ALGORITHMS[algo].assessed and train_config.num_envs > 1:
-        raise ConfigError("num_envs", f"takes 1 for {algo}, whose policies are assessed one episode after another")
+        raise ConfigError("num_envs", f"expects 1 for {algo}, whose policies are assessed one episode after another")
     return Config(algo, env, physics, eval_physics, agent, train_config)
 
 
@@ -170,7 +170,7 @@ def check_physics(config: Config) -> None:
     for setting, physics in {"physics": config.physics, "eval_physics": eval_physics_of(config)}.items():
         if missing := envs.lacks(physics):
             here = ", ".join(name for name in envs.simulators(config.env) if not envs.lacks(name))
-            raise ConfigError(setting, f"{physics} needs {missing}; takes one of {here} here")
+            raise ConfigError(setting, f"{physics} needs {missing}; expects one of {here} here")
 
 
 def make_agent(algo: str, observation_size: int, action_size: int, **settings: Any) -> Agent:
@@ -205,7 +205,7 @@ def replay_of(config: Config, env: Environment) -> Replay:
 
 
 def make_trainer(config: Config, env: Environment | None = None) -> train.Trainer:
-    """Training of one member as pure functions; `env` takes the place of the named environment."""
+    """Training of one member as pure functions; `env` expects the place of the named environment."""
     eval_env = env
     if env is None:
         env = envs.make(config.env, config.physics)

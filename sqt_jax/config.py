@@ -61,7 +61,7 @@ class AgentConfig:
     min_priority: float = 1.0  # where the critics' Huber loss becomes linear, and the smallest |TD error| of LAP
     # TD7's replay and policy checkpoints.
     priority_exponent: float = 0.4
-    checkpoint_switch: int = 750_000  # gradient steps after which an assessment takes `assessment_episodes`
+    checkpoint_switch: int = 750_000  # gradient steps after which an assessment expects `assessment_episodes`
     assessment_episodes: int = 20
     checkpoint_reset_weight: float = 0.9  # what the best minimum return is multiplied with at the switch
 
@@ -105,7 +105,7 @@ class Config:
     train: TrainConfig
 
     def flat(self) -> dict[str, Any]:
-        """All settings by name, without nesting: what `config.json` holds and `make_config` takes back."""
+        """All settings by name, without nesting: what `config.json` holds and `make_config` expects back."""
         own = {"algo": self.algo, "env": self.env, "physics": self.physics, "eval_physics": self.eval_physics}
         return own | dataclasses.asdict(self.agent) | dataclasses.asdict(self.train)
 
@@ -126,7 +126,7 @@ SWITCHES = (
     "value_clipping",
 )
 
-# Limits of numbers, as (lowest, highest, what the setting takes).
+# Limits of numbers, as (lowest, highest, what the setting expects).
 LIMITS: dict[str, tuple[float, float, str]] = {
     "penalty_coef": (0, math.inf, "a number of at least 0"),
     "ddof": (0, math.inf, "a whole number of at least 0"),
@@ -171,23 +171,23 @@ def _brief(value: Any) -> str:
 def check_value(setting: str, value: Any) -> None:
     """Raises ConfigError where `value` alone, whatever the other settings are, cannot be."""
     if setting in CHOICES and value not in CHOICES[setting]:
-        raise ConfigError(setting, f"takes one of {', '.join(CHOICES[setting])}, not {value!r}")
+        raise ConfigError(setting, f"expects one of {', '.join(CHOICES[setting])}, not {value!r}")
     if setting in LIMITS:
-        low, high, takes = LIMITS[setting]
-        kinds, largest = ((int,), LARGEST_INTEGER) if "whole" in takes else ((int, float), LARGEST_NUMBER)
+        low, high, expects = LIMITS[setting]
+        kinds, largest = ((int,), LARGEST_INTEGER) if "whole" in expects else ((int, float), LARGEST_NUMBER)
         if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= min(high, largest):
             if isinstance(value, kinds) and value > largest and high == math.inf:
-                takes = f"{takes} and at most {largest}"
-            raise ConfigError(setting, f"takes {takes}, not {value!r}")
+                expects = f"{expects} and at most {largest}"
+            raise ConfigError(setting, f"expects {expects}, not {value!r}")
     if setting in SWITCHES and not isinstance(value, bool):
-        raise ConfigError(setting, f"takes true or false, not {value!r}")
+        raise ConfigError(setting, f"expects true or false, not {value!r}")
     if setting == "hidden" and not (
         isinstance(value, (tuple, list))
         and 1 <= len(value) <= MAX_LAYERS
         and all(type(w) is int and 1 <= w <= 65536 for w in value)
     ):
-        takes = f"layer widths, up to {MAX_LAYERS} whole numbers from 1 to 65536 as in 256,256"
-        raise ConfigError(setting, f"takes {takes}, not {_brief(value)}")
+        expects = f"layer widths, up to {MAX_LAYERS} whole numbers from 1 to 65536 as in 256,256"
+        raise ConfigError(setting, f"expects {expects}, not {_brief(value)}")
 
 
 def _refuse(wrong: bool, setting: str, message: str) -> None:
@@ -201,23 +201,25 @@ def check_agent(algo: str, agent: AgentConfig) -> None:
         check_value(name, value)
     n = agent.ensemble_size
     if agent.penalty == "none":
-        message = f"takes 0 for {algo}, which has no penalty (its _sqt and _sqt_tuple forms have one)"
+        message = f"expects 0 for {algo}, which has no penalty (its _sqt and _sqt_tuple forms have one)"
         _refuse(agent.penalty_coef > 0, "penalty_coef", message)
         _refuse(not agent.penalty_inside_gamma, "penalty_inside_gamma", f"has no effect with {algo}")
     else:
-        _refuse(n < 2, "ensemble_size", f"takes at least 2 for {algo}: one critic alone has no disagreement")
+        _refuse(n < 2, "ensemble_size", f"expects at least 2 for {algo}: one critic alone has no disagreement")
     # Without a penalty too: the disagreement is reported, unless there is one critic alone.
-    _refuse(n > 1 and agent.ddof >= n, "ddof", f"takes a number below the ensemble_size ({n}), not {agent.ddof}")
+    _refuse(n > 1 and agent.ddof >= n, "ddof", f"expects a number below the ensemble_size ({n}), not {agent.ddof}")
     if agent.reduce == "subset_min":
-        _refuse(agent.subset_size > n, "subset_size", f"takes at most the ensemble_size ({n}), not {agent.subset_size}")
+        _refuse(
+            agent.subset_size > n, "subset_size", f"expects at most the ensemble_size ({n}), not {agent.subset_size}"
+        )
     else:
         differs = agent.subset_size != AgentConfig.subset_size
         _refuse(differs, "subset_size", f"has no effect with --reduce={agent.reduce}")
     if agent.learn_temperature:
-        _refuse(agent.temperature <= 0, "temperature", "takes a positive start where it is learned")
-        _refuse(agent.networks == "sale", "temperature", "takes a number with --networks=sale, not auto")
+        _refuse(agent.temperature <= 0, "temperature", "expects a positive start where it is learned")
+        _refuse(agent.networks == "sale", "temperature", "expects a number with --networks=sale, not auto")
         # The target entropy is that of the action, summed over its dimensions.
-        message = "takes true where the temperature is learned"
+        message = "expects true where the temperature is learned"
         _refuse(not agent.squashed_log_prob, "squashed_log_prob", message)
 
 
@@ -228,15 +230,15 @@ def check_train(train: TrainConfig) -> None:
     _refuse(
         train.warmup_steps >= train.steps,
         "warmup_steps",
-        f"takes fewer than the run's steps ({train.steps}), not {train.warmup_steps}: nothing would be learned",
+        f"expects fewer than the run's steps ({train.steps}), not {train.warmup_steps}: nothing would be learned",
     )
-    _refuse(train.capacity < 1, "replay_capacity", f"takes at least num_envs ({train.num_envs})")
+    _refuse(train.capacity < 1, "replay_capacity", f"expects at least num_envs ({train.num_envs})")
     _refuse(
         train.batch_size > train.capacity,
         "batch_size",
-        f"takes at most the replay's capacity ({train.capacity}), not {train.batch_size}",
+        f"expects at most the replay's capacity ({train.capacity}), not {train.batch_size}",
     )
     for name in ("steps", "warmup_steps", "eval_every"):
         value = getattr(train, name)
-        message = f"takes a multiple of num_envs ({train.num_envs}), not {value}"
+        message = f"expects a multiple of num_envs ({train.num_envs}), not {value}"
         _refuse(value % train.num_envs != 0, name, message)

@@ -96,7 +96,7 @@ def evaluate_policy(
       policy: obs [B, O] -> action [B, A] in [-1, 1]; with an `Environment` it is traced, and has to be JAX code.
       env: an `Environment` on any physics, or one of Gymnasium's, whose action space is a bounded box and whose
         episodes end (made by `gymnasium.make`, they have a time limit).
-      seed: of all the starts; Gymnasium's episode k takes `seed + k`.
+      seed: of all the starts; Gymnasium's episode k expects `seed + k`.
 
     Returns:
       Undiscounted returns [episodes] and lengths [episodes].

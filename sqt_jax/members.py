@@ -86,5 +86,5 @@ def usable_devices(members: int) -> int:
 
 
 def layout_here(members: int) -> Layout:
-    """A sweep on the devices that it takes by itself."""
+    """A sweep on the devices that it expects by itself."""
     return Layout(members, tuple(jax.local_devices()[: usable_devices(members)]))

@@ -13,4 +13,4 @@ def nearest(name: object, known: Iterable[str]) -> str:
 def unknown(name: object, known: Iterable[str]) -> str:
     """All the known names, and the nearest one."""
     known = list(known)
-    return f"takes one of {', '.join(known)}, not {name!r}{nearest(name, known)}"
+    return f"expects one of {', '.join(known)}, not {name!r}{nearest(name, known)}"

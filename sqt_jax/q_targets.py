@@ -5,7 +5,7 @@
     penalty         = coef * mean_b std_i Q_i(s'_b, a'_b)      SQT        (paper eq. 20: one scalar per batch)
                     = coef * std_i Q_i(s', a')                 SQT-tuple  (paper eq. 19: one value per transition)
 
-Everything takes the whole batch, `next_q [N, B]` of the N *target* critics at (s', a'): SQT's penalty is a mean over
+Everything expects the whole batch, `next_q [N, B]` of the N *target* critics at (s', a'): SQT's penalty is a mean over
 the batch. The variants are functions of `next_q` to be bound with `functools.partial`:
 
     penalty = functools.partial(q_targets.batch_std, coef=0.5)
@@ -45,7 +45,7 @@ def random_subset(key: Array, ensemble_size: int, subset_size: int) -> Array:
       ValueError: there are fewer critics than that.
     """
     if not 1 <= subset_size <= ensemble_size:
-        raise ValueError(f"a subset takes 1 to {ensemble_size} of the critics, not {subset_size}")
+        raise ValueError(f"a subset expects 1 to {ensemble_size} of the critics, not {subset_size}")
     return jax.random.permutation(key, ensemble_size)[:subset_size]
 
 

@@ -87,7 +87,7 @@ class Ring(NamedTuple):
         wanted = {"obs": (e, o), "action": (e, a), "reward": (e,), "next_obs": (e, o), "discount": (e,)}
         given = {name: jnp.shape(value) for name, value in transition._asdict().items()}
         if given != wanted:
-            raise ValueError(f"takes transitions of {wanted}, not {given}")
+            raise ValueError(f"expects transitions of {wanted}, not {given}")
         before = state.inserted - self.num_envs + jnp.arange(self.num_envs)  # the numbers of the rows before
         final = (before >= 0) & jnp.any(state.newest != transition.obs, axis=-1)
         order = jnp.cumsum(final, dtype=jnp.int32) - 1

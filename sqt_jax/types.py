@@ -50,7 +50,7 @@ class TimeStep(NamedTuple):
 class Environment(NamedTuple):
     """A task as pure functions of one environment; `vmap` gives many.
 
-    `step` takes actions in [-1, 1] and starts a new episode by itself, with a new random start each time.
+    `step` expects actions in [-1, 1] and starts a new episode by itself, with a new random start each time.
     """
 
     name: str

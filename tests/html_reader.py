@@ -4,7 +4,7 @@ from html.parser import HTMLParser
 
 
 class Reader(HTMLParser):
-    """Tags and texts of a page, as a browser takes them."""
+    """Tags and texts of a page, as a browser expects them."""
 
     def __init__(self, text):
         super().__init__()

@@ -88,7 +88,7 @@ def test_sale_networks_make_the_same_actions_in_td7s_update_without_its_checkpoi
 @pytest.mark.parametrize("algo", TD7)
 def test_td7_has_its_own_networks(algo):
     assert make_config(algo, "ant").agent.networks == "sale"
-    with pytest.raises(ConfigError, match=f"--networks: takes sale for {algo}$"):
+    with pytest.raises(ConfigError, match=f"--networks: expects sale for {algo}$"):
         make_config(algo, "ant", networks="mlp")
 
 
@@ -121,7 +121,7 @@ def test_no_other_penalty_than_the_names_own_is_taken(algo):
 def test_several_environments_are_refused_for_td7_alone(algo):
     settings = {"num_envs": 4, "warmup_steps": 400, "eval_every": 400, "steps": 4000}
     if algo in TD7:
-        with pytest.raises(ConfigError, match=f"--num_envs: takes 1 for {algo}, ") as error:
+        with pytest.raises(ConfigError, match=f"--num_envs: expects 1 for {algo}, ") as error:
             make_config(algo, "ant", **settings)
         assert error.value.setting == "num_envs"
     else:

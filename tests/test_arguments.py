@@ -26,18 +26,18 @@ def test_runs_and_flags_in_any_order(parser):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "RUNS: takes folders of runs or folders above them, as in python -m experiments.tables RUNS..."),
+        ([], "RUNS: expects folders of runs or folders above them, as in python -m experiments.tables RUNS..."),
         (["a", "--formt=svg"], "--formt: unknown flag; did you mean --format?"),
         (["a", "--xyz"], "--xyz: unknown flag; --help lists the flags"),
         (["a", "--form=svg"], "--form: unknown flag; did you mean --format?"),  # no abbreviations
-        (["a", "--format=gif"], "--format: takes one of png, svg, not 'gif'"),
-        (["a", "--format"], "--format: takes one of png, svg"),
-        (["a", "--seed", "--overwrite"], "--seed: takes a whole number of at least 0"),
-        (["a", "--out"], "--out: takes a folder"),
-        (["a", "--camera"], "--camera: takes a name"),
-        (["a", "--seed=-1"], "--seed: takes a whole number of at least 0, not '-1'"),
-        (["a", "--out="], "--out: takes a folder"),
-        (["a", "--overwrite=yes"], "--overwrite: is a switch and takes no value"),
+        (["a", "--format=gif"], "--format: expects one of png, svg, not 'gif'"),
+        (["a", "--format"], "--format: expects one of png, svg"),
+        (["a", "--seed", "--overwrite"], "--seed: expects a whole number of at least 0"),
+        (["a", "--out"], "--out: expects a folder"),
+        (["a", "--camera"], "--camera: expects a name"),
+        (["a", "--seed=-1"], "--seed: expects a whole number of at least 0, not '-1'"),
+        (["a", "--out="], "--out: expects a folder"),
+        (["a", "--overwrite=yes"], "--overwrite: is a switch and expects no value"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(parser, argv, message):
@@ -62,7 +62,7 @@ def test_files_are_replaced_only_where_that_is_asked_for(tmp_path):
     out = tmp_path / "new" / "tables"
     arguments.refuse_existing(out, ["a.csv"], overwrite=False)
     arguments.write_files(out, {"a.csv": b"1"})
-    with pytest.raises(UsageError, match="a.csv is there already; takes another folder, or --overwrite replaces it"):
+    with pytest.raises(UsageError, match="a.csv is there already; expects another folder, or --overwrite replaces it"):
         arguments.refuse_existing(out, ["b.csv", "a.csv"], overwrite=False)
     arguments.refuse_existing(out, ["a.csv"], overwrite=True)
     arguments.write_files(out, {"a.csv": b"2"})
@@ -72,12 +72,12 @@ def test_files_are_replaced_only_where_that_is_asked_for(tmp_path):
 def test_folders_that_cannot_be_written(tmp_path):
     file = tmp_path / "file"
     file.write_text("x")
-    with pytest.raises(UsageError, match="takes a folder, which this is not"):
+    with pytest.raises(UsageError, match="expects a folder, which this is not"):
         arguments.refuse_existing(file, ["a.csv"], overwrite=True)
     for out in (file / "below", file / "below" / "further", tmp_path / ("x" * 300)):
-        with pytest.raises(UsageError, match="^--out=.*: takes a folder that can be written"):
+        with pytest.raises(UsageError, match="^--out=.*: expects a folder that can be written"):
             arguments.refuse_existing(out, ["a.csv"], overwrite=True)
-        with pytest.raises(UsageError, match="^--out=.*: takes a folder that can be written"):
+        with pytest.raises(UsageError, match="^--out=.*: expects a folder that can be written"):
             arguments.write_files(out, {"a.csv": b""})
     (tmp_path / "a.csv").mkdir()
     with pytest.raises(UsageError, match="a.csv is a folder"):
@@ -99,13 +99,13 @@ def test_one_file_is_written_whole(tmp_path):
         arguments.write_file(out, content)
         assert out.read_bytes() == content and [*out.parent.iterdir()] == [out]
     for path in (tmp_path, out / "below.html", tmp_path / ("x" * 300)):
-        with pytest.raises(UsageError, match="--out=.*: takes a file"):
+        with pytest.raises(UsageError, match="--out=.*: expects a file"):
             arguments.write_file(path, b"")
 
 
 @pytest.mark.parametrize("text", ["", ".", "/", "folder/", "a\0b"])
 def test_what_can_be_no_file(text):
-    with pytest.raises(argparse.ArgumentTypeError, match="takes a file"):
+    with pytest.raises(argparse.ArgumentTypeError, match="expects a file"):
         arguments.file(text)
 
 
@@ -120,10 +120,12 @@ def test_a_command_for_one_run_takes_one():
     options = made.read(["play", "a", "--seed=9"])
     assert (options.runs, options.seed) == (["a"], 9)
     for runs in ([], ["a", "b"]):
-        with pytest.raises(UsageError, match="RUN: takes the folder of one run, as in python -m experiments.play RUN"):
+        with pytest.raises(
+            UsageError, match="RUN: expects the folder of one run, as in python -m experiments.play RUN"
+        ):
             made.read(["play", *runs])
     for text in ("10", "-1", "1.0", "", "9" * 5000):
-        with pytest.raises(UsageError, match="--seed: takes a whole number from 0 to 9, not"):
+        with pytest.raises(UsageError, match="--seed: expects a whole number from 0 to 9, not"):
             made.read(["play", "a", f"--seed={text}"])
 
 
@@ -134,12 +136,12 @@ def test_a_file_that_could_not_be_written_is_refused_before(tmp_path):
     (tmp_path / "folder.mp4").mkdir()
     for name in ("film.mp4", "link.mp4"):
         refuse_file("--video", tmp_path / name, overwrite=True)
-        with pytest.raises(UsageError, match=f"--video=.*/{name}: is there already; takes another file, or --over"):
+        with pytest.raises(UsageError, match=f"--video=.*/{name}: is there already; expects another file, or --over"):
             refuse_file("--video", tmp_path / name, overwrite=False)
     cannot = {
-        "folder.mp4": "takes a file, which this folder is not",
-        "film.mp4/film.mp4": "takes a file in a folder that can be written",
-        "x" * 300 + ".mp4": "takes a file that can be written: File name too long",
+        "folder.mp4": "expects a file, which this folder is not",
+        "film.mp4/film.mp4": "expects a file in a folder that can be written",
+        "x" * 300 + ".mp4": "expects a file that can be written: File name too long",
     }
     for name, message in cannot.items():
         with pytest.raises(UsageError, match=message):

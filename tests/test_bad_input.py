@@ -53,13 +53,13 @@ def snapshot(path):
     return found
 
 
-def refused(folder, capsys, arguments, begins, takes):
+def refused(folder, capsys, arguments, begins, expects):
     """One line that begins and goes on as it should, and nothing else."""
     before = snapshot(folder)
     assert run(*arguments) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.endswith("\n") and err.count("\n") == 1 and err[:-1].isprintable(), err
-    assert err.startswith(begins) and re.search(takes, err[len(begins) :]), err
+    assert err.startswith(begins) and re.search(expects, err[len(begins) :]), err
     assert snapshot(folder) == before
 
 
@@ -71,43 +71,43 @@ FLAGS = [
     ("--nosteps", "--nosteps: unknown flag", "did you mean --steps"),
     ("--flagfile=file", "--flagfile: unknown flag", "--help"),
     ("--undefok=stepz", "--undefok: unknown flag", "--help"),
-    ("--steps", "--steps:", "takes a whole number"),
+    ("--steps", "--steps:", "expects a whole number"),
     ("extra", "extra:", "--flag=value"),
-    ("--steps=many", "--steps=many:", "takes a whole number"),
-    ("--steps=1.5", "--steps=1.5:", "takes a whole number"),
-    ("--steps=nan", "--steps=nan:", "takes a whole number"),
-    ("--steps=1\x1b[31m", "--steps=1\\x1b[31m:", "takes a whole number"),
-    ("--steps=0", "--steps:", "takes a whole number from 1 to"),
-    ("--steps=1e300", "--steps:", "takes a whole number from 1 to"),
-    ("--steps=" + "9" * 5000, "--steps=", "takes a whole number"),
+    ("--steps=many", "--steps=many:", "expects a whole number"),
+    ("--steps=1.5", "--steps=1.5:", "expects a whole number"),
+    ("--steps=nan", "--steps=nan:", "expects a whole number"),
+    ("--steps=1\x1b[31m", "--steps=1\\x1b[31m:", "expects a whole number"),
+    ("--steps=0", "--steps:", "expects a whole number from 1 to"),
+    ("--steps=1e300", "--steps:", "expects a whole number from 1 to"),
+    ("--steps=" + "9" * 5000, "--steps=", "expects a whole number"),
     ("--ddof=" + "9" * 400, "--ddof:", "at most 2147483647"),
     ("--policy_delay=1e12", "--policy_delay:", "at most 2147483647"),
     ("--updates_per_step=-1", "--updates_per_step:", "at least 1"),
     ("--penalty_coef=1e39", "--penalty_coef:", "at most 3.4e"),
     ("--penalty_coef=-0.1", "--penalty_coef:", "at least 0"),
-    ("--lr=nan", "--lr=nan:", "takes a number"),
-    ("--lr=inf", "--lr=inf:", "takes a number"),
-    ("--lr=0.1,,0.2", "--lr=0.1,,0.2:", "takes a number"),
-    ("--lr=1e-3,1e-3", "--lr:", "takes each value once"),
-    ("--gamma=1.01", "--gamma:", "takes a number from 0 to 1"),
-    ("--hidden=8,wide", "--hidden=8,wide:", "takes whole numbers"),
-    ("--hidden=8,0", "--hidden:", "takes layer widths"),
+    ("--lr=nan", "--lr=nan:", "expects a number"),
+    ("--lr=inf", "--lr=inf:", "expects a number"),
+    ("--lr=0.1,,0.2", "--lr=0.1,,0.2:", "expects a number"),
+    ("--lr=1e-3,1e-3", "--lr:", "expects each value once"),
+    ("--gamma=1.01", "--gamma:", "expects a number from 0 to 1"),
+    ("--hidden=8,wide", "--hidden=8,wide:", "expects whole numbers"),
+    ("--hidden=8,0", "--hidden:", "expects layer widths"),
     ("--hidden=" + ",".join(["8"] * 1000), "--hidden:", "up to 32"),
-    ("--train_encoder=maybe", "--train_encoder=maybe:", "takes true or false"),
+    ("--train_encoder=maybe", "--train_encoder=maybe:", "expects true or false"),
     ("--temperature=warm", "--temperature=warm:", "or auto"),
-    ("--reduce=max", "--reduce:", "takes one of min, mean"),
-    ("--seeds=-1", "--seeds=-1:", "takes whole numbers from 0"),
-    ("--seeds=4294967296", "--seeds=4294967296:", "takes whole numbers from 0"),
-    ("--seeds=0,1,0", "--seeds:", "takes each value once"),
-    ("--seeds=" + ",".join(map(str, range(10_001))), "--seeds:", "takes at most 10000 members"),
-    ("--algo=sac_sqtt", "--algo:", "takes one of td3"),
-    ("--env=antt", "--env:", "takes one of cheetah"),
-    ("--env=brax:antt", "--env:", "takes one of"),
-    ("--physics=warp9", "--physics:", "takes one of mjx"),
-    ("--eval_physics=warp9", "--eval_physics:", "takes one of auto"),
-    ("--preset=fast", "--preset=fast:", "takes one of paper"),
+    ("--reduce=max", "--reduce:", "expects one of min, mean"),
+    ("--seeds=-1", "--seeds=-1:", "expects whole numbers from 0"),
+    ("--seeds=4294967296", "--seeds=4294967296:", "expects whole numbers from 0"),
+    ("--seeds=0,1,0", "--seeds:", "expects each value once"),
+    ("--seeds=" + ",".join(map(str, range(10_001))), "--seeds:", "expects at most 10000 members"),
+    ("--algo=sac_sqtt", "--algo:", "expects one of td3"),
+    ("--env=antt", "--env:", "expects one of cheetah"),
+    ("--env=brax:antt", "--env:", "expects one of"),
+    ("--physics=warp9", "--physics:", "expects one of mjx"),
+    ("--eval_physics=warp9", "--eval_physics:", "expects one of auto"),
+    ("--preset=fast", "--preset=fast:", "expects one of paper"),
     ("--checkpoint_every=-20", "--checkpoint_every:", "at least 0"),
-    ("--checkpoint_every=often", "--checkpoint_every=often:", "takes a whole number"),
+    ("--checkpoint_every=often", "--checkpoint_every=often:", "expects a whole number"),
     ("--keep_checkpoints=0", "--keep_checkpoints:", "at least 1"),
     ("--devices=0", "--devices:", "at least 1"),
     ("--devices=two", "--devices=two:", "a whole number"),
@@ -115,13 +115,13 @@ FLAGS = [
     ("--name=a/b", "--name=a/b:", "no slashes"),
     ("--name=..", "--name=..:", "no slashes"),
     ("--name=a\nb", "--name=a\\nb:", "no slashes or control characters"),
-    ("--name=" + "x" * 300, "--name=xxx", "takes up to 200 bytes"),
-    ("--name=run", "--name=run:", "takes another name"),
-    ("--out=", "--out=:", "takes a folder"),
-    ("--out=file", "--out=file:", "takes a folder that can be written"),
-    ("--out=/proc/none", "--out=/proc/none:", "takes a folder that can be written"),
-    ("--out=" + "x" * 300, "--out=xxx", "takes a folder"),
-    ("--out=a\0b", "--out=a\\x00b:", "takes a folder"),
+    ("--name=" + "x" * 300, "--name=xxx", "expects up to 200 bytes"),
+    ("--name=run", "--name=run:", "expects another name"),
+    ("--out=", "--out=:", "expects a folder"),
+    ("--out=file", "--out=file:", "expects a folder that can be written"),
+    ("--out=/proc/none", "--out=/proc/none:", "expects a folder that can be written"),
+    ("--out=" + "x" * 300, "--out=xxx", "expects a folder"),
+    ("--out=a\0b", "--out=a\\x00b:", "expects a folder"),
 ]
 
 
@@ -129,39 +129,39 @@ def short(value):
     return ascii(value)[1:40]
 
 
-@pytest.mark.parametrize(("argument", "begins", "takes"), FLAGS, ids=[short(row[0]) for row in FLAGS])
-def test_a_bad_flag_is_refused(folder, capsys, argument, begins, takes):
-    refused(folder, capsys, [*NEW.split(), argument], begins, takes)
+@pytest.mark.parametrize(("argument", "begins", "expects"), FLAGS, ids=[short(row[0]) for row in FLAGS])
+def test_a_bad_flag_is_refused(folder, capsys, argument, begins, expects):
+    refused(folder, capsys, [*NEW.split(), argument], begins, expects)
 
 
 # Flags that do not go together
 
 TOGETHER = [
-    ("--algo=sac --penalty_coef=0.5", "--penalty_coef:", "takes 0 for sac"),
+    ("--algo=sac --penalty_coef=0.5", "--penalty_coef:", "expects 0 for sac"),
     ("--algo=td3_sqt --temperature=0.1,0.2", "--temperature:", "has no effect with td3_sqt"),
-    ("--algo=td7 --num_envs=2", "--num_envs:", "takes 1 for td7"),
-    ("--num_envs=7", "--steps:", "takes a multiple of num_envs"),
+    ("--algo=td7 --num_envs=2", "--num_envs:", "expects 1 for td7"),
+    ("--num_envs=7", "--steps:", "expects a multiple of num_envs"),
     (
         "--num_envs=20 --eval_every=20 --checkpoint_every=30",
         "--checkpoint_every:",
-        r"takes a multiple of num_envs \(20",
+        r"expects a multiple of num_envs \(20",
     ),
-    ("--ensemble_size=1", "--ensemble_size:", "takes at least 2"),
+    ("--ensemble_size=1", "--ensemble_size:", "expects at least 2"),
     ("--ensemble_size=3 --ddof=3", "--ddof:", "below the ensemble_size"),
-    ("--reduce=subset_min --subset_size=3", "--subset_size:", "takes at most the ensemble_size"),
-    ("--batch_size=50 --replay_capacity=40", "--batch_size:", "takes at most the replay's capacity"),
-    ("--warmup_steps=60", "--warmup_steps:", "takes fewer than the run's steps"),
-    ("--networks=sale --temperature=auto", "--temperature:", "takes a number with"),
+    ("--reduce=subset_min --subset_size=3", "--subset_size:", "expects at most the ensemble_size"),
+    ("--batch_size=50 --replay_capacity=40", "--batch_size:", "expects at most the replay's capacity"),
+    ("--warmup_steps=60", "--warmup_steps:", "expects fewer than the run's steps"),
+    ("--networks=sale --temperature=auto", "--temperature:", "expects a number with"),
     ("--preset=released --networks=mlp", "--", "by --preset=released"),
-    ("--env=brax:ant --physics=mujoco", "--physics:", "takes one of"),
-    ("--steps=2e9 --replay_capacity=2e9", "--replay_capacity=", "takes a smaller number"),
+    ("--env=brax:ant --physics=mujoco", "--physics:", "expects one of"),
+    ("--steps=2e9 --replay_capacity=2e9", "--replay_capacity=", "expects a smaller number"),
     ("--resume --overwrite", "--overwrite:", "no --resume beside it"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "begins", "takes"), TOGETHER, ids=[row[0] for row in TOGETHER])
-def test_flags_that_cannot_be_together_are_refused(folder, capsys, arguments, begins, takes):
-    refused(folder, capsys, [*NEW.split(), *arguments.split()], begins, takes)
+@pytest.mark.parametrize(("arguments", "begins", "expects"), TOGETHER, ids=[row[0] for row in TOGETHER])
+def test_flags_that_cannot_be_together_are_refused(folder, capsys, arguments, begins, expects):
+    refused(folder, capsys, [*NEW.split(), *arguments.split()], begins, expects)
 
 
 # --config=FILE
@@ -169,46 +169,48 @@ def test_flags_that_cannot_be_together_are_refused(folder, capsys, arguments, be
 DEEP = "\n".join(["a: &a [x]", *(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in zip("abcdefgh", "bcdefghi"))])  # noqa: B905
 MERGED = DEEP.replace("[x]", "{x: 1}").replace("[*", "{<<: [*").replace("]", "]}")
 FILES = {
-    "truncated": ("steps: [5", "takes a YAML file"),
-    "twice": ("steps: 5\nseeds: 1\nsteps: 6", "takes each setting once, not steps 2 times"),
-    "list": ("- steps", "takes lines like"),
-    "word": ("steps", "takes lines like"),
-    "nothing": ("", "takes lines like"),
+    "truncated": ("steps: [5", "expects a YAML file"),
+    "twice": ("steps: 5\nseeds: 1\nsteps: 6", "expects each setting once, not steps 2 times"),
+    "list": ("- steps", "expects lines like"),
+    "word": ("steps", "expects lines like"),
+    "nothing": ("", "expects lines like"),
     "unknown": ("stepz: 5", "did you mean --steps"),
     "absl's": ("undefok: stepz", "unknown flag"),
-    "value": ("steps: many", "takes a whole number"),
-    "range": ("gamma: 2", "takes a number from 0 to 1"),
-    "nan": ("lr: .nan", "takes a number"),
-    "date": ("steps: 2025-99-99", "takes a YAML file"),
-    "tagged": ("steps: !!bool perhaps", "takes a YAML file"),
-    "mapping": ("steps: {a: 5}", "steps takes a number, a word"),
-    "null": ("steps:", "steps takes a number, a word"),
-    "number": ("5: 6", "takes lines like"),
+    "value": ("steps: many", "expects a whole number"),
+    "range": ("gamma: 2", "expects a number from 0 to 1"),
+    "nan": ("lr: .nan", "expects a number"),
+    "date": ("steps: 2025-99-99", "expects a YAML file"),
+    "tagged": ("steps: !!bool perhaps", "expects a YAML file"),
+    "mapping": ("steps: {a: 5}", "steps expects a number, a word"),
+    "null": ("steps:", "steps expects a number, a word"),
+    "number": ("5: 6", "expects lines like"),
     "resume": ("resume: runs", "resume is for the command line"),
-    "zero": ('out: "a\\0b"', "takes a folder"),
-    "surrogate": ('out: "\\ud800"', "takes a folder"),
-    "python": ("steps: !!python/object/apply:os.system ['touch hacked']", "takes a YAML file"),
-    "laughs": (DEEP, "takes a number, a word"),
-    "merged": (MERGED, "takes a YAML file"),
-    "deep": ("steps: " + "[" * 2000, "takes a YAML file"),
-    "large": ("#" * 200_000, "takes a file of at most 100000 bytes"),
-    "binary": (bytes(range(256)), "takes a YAML file"),
-    "latin1": ("name: é".encode("latin1"), "takes a YAML file"),
+    "zero": ('out: "a\\0b"', "expects a folder"),
+    "surrogate": ('out: "\\ud800"', "expects a folder"),
+    "python": ("steps: !!python/object/apply:os.system ['touch hacked']", "expects a YAML file"),
+    "laughs": (DEEP, "expects a number, a word"),
+    "merged": (MERGED, "expects a YAML file"),
+    "deep": ("steps: " + "[" * 2000, "expects a YAML file"),
+    "large": ("#" * 200_000, "expects a file of at most 100000 bytes"),
+    "binary": (bytes(range(256)), "expects a YAML file"),
+    "latin1": ("name: é".encode("latin1"), "expects a YAML file"),
 }
 
 
 @pytest.mark.parametrize("case", FILES)
 def test_a_bad_file_of_flags_is_refused(folder, capsys, case):
-    content, takes = FILES[case]
+    content, expects = FILES[case]
     (folder / "flags.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
     given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would win
-    refused(folder, capsys, [*given, "--config=flags.yaml"], "--", takes)
+    refused(folder, capsys, [*given, "--config=flags.yaml"], "--", expects)
 
 
 @pytest.mark.parametrize("path", ["none.yaml", "empty", "/dev/zero", "x" * 300, "fifo", "lön\x07k"])
 def test_what_is_no_file_is_refused(folder, capsys, path):
     os.mkfifo(folder / "fifo")
-    refused(folder, capsys, [*NEW.split(), f"--config={path}"], "--config=", "takes a file|no such file|cannot be read")
+    refused(
+        folder, capsys, [*NEW.split(), f"--config={path}"], "--config=", "expects a file|no such file|cannot be read"
+    )
 
 
 # --resume=DIR
@@ -239,13 +241,13 @@ def without(key):
 # What is changed in config.json.
 CHANGED = {
     "unknown setting": (settings(stepz=5), "--stepz: is not a setting"),
-    "setting out of range": (settings(gamma=2), "--gamma: takes a number from 0 to 1"),
-    "setting of no kind": (settings(hidden={"a": 1}), "--hidden: takes layer widths"),
-    "setting too large": (settings(ddof=10**400), "--ddof: takes"),
-    "layers without end": (settings(hidden=[8] * 10_000), "--hidden: takes layer widths"),
-    "no algorithm": (settings(algo="ppo"), "--algo: takes one of"),
-    "another environment": (settings(env="/etc/passwd"), "--env: takes one of"),
-    "steps that are a list": (settings(steps=[60]), "--steps: takes"),
+    "setting out of range": (settings(gamma=2), "--gamma: expects a number from 0 to 1"),
+    "setting of no kind": (settings(hidden={"a": 1}), "--hidden: expects layer widths"),
+    "setting too large": (settings(ddof=10**400), "--ddof: expects"),
+    "layers without end": (settings(hidden=[8] * 10_000), "--hidden: expects layer widths"),
+    "no algorithm": (settings(algo="ppo"), "--algo: expects one of"),
+    "another environment": (settings(env="/etc/passwd"), "--env: expects one of"),
+    "steps that are a list": (settings(steps=[60]), "--steps: expects"),
     "no settings": (without("settings"), "does not describe a run"),
     "settings that are a list": (entries(settings=[1]), "does not describe a run"),
     "no members": (entries(members=[]), "does not describe a run"),
@@ -264,19 +266,19 @@ CHANGED = {
     "nan": (entries(device=float("nan")), "does not describe a run"),
     "infinity": (entries(device=float("inf")), "does not describe a run"),
     "another algorithm": (settings(algo="sac", penalty="none", penalty_coef=0.0), "these differ: algo"),
-    "another version": (entries(versions={"sqt_jax": "9.9.0\x1b"}), "takes a run of sqt_jax"),
-    "no version": (entries(versions={}), "takes a run of sqt_jax"),
+    "another version": (entries(versions={"sqt_jax": "9.9.0\x1b"}), "expects a run of sqt_jax"),
+    "no version": (entries(versions={}), "expects a run of sqt_jax"),
 }
 
 
 @pytest.mark.parametrize("case", CHANGED)
 def test_a_run_whose_settings_cannot_be_is_refused(folder, capsys, case):
-    change, takes = CHANGED[case]
+    change, expects = CHANGED[case]
     config = json.loads((RUN / "config.json").read_text())
     change(config)
     (RUN / "config.json").write_text(json.dumps(config))
     algo = ["--algo=sac_sqt"] if case == "another algorithm" else []
-    refused(folder, capsys, [f"--resume={RUN}", *algo], f"--resume={RUN}:", takes)
+    refused(folder, capsys, [f"--resume={RUN}", *algo], f"--resume={RUN}:", expects)
 
 
 def replaced_by(content):
@@ -326,7 +328,7 @@ DAMAGED = {
     "table is a link": (linked("evaluations.csv"), "evaluations.csv in it is a link"),
     "curves are a link": (linked("curves.png"), "curves.png in it is a link"),
     "lock is a link": (linked("lock"), "lock in it is a link"),
-    "lock is a folder": (a_folder("lock"), "takes a folder that can be written"),
+    "lock is a folder": (a_folder("lock"), "expects a folder that can be written"),
     "checkpoint is a link": (linked("checkpoint"), "checkpoint in it is a link"),
     "policy is a link": (linked("policy"), "policy in it is a link"),
     "events are a link": (linked("tensorboard"), "tensorboard in it is a link"),
@@ -337,43 +339,43 @@ DAMAGED = {
 
 @pytest.mark.parametrize("case", DAMAGED)
 def test_a_damaged_run_is_refused(folder, capsys, case):
-    damage, takes = DAMAGED[case]
+    damage, expects = DAMAGED[case]
     damage(RUN / "config.json")
     further = ["--steps=160"] if case.startswith("table") else []  # else it is finished, and left as it is
-    refused(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", takes)
+    refused(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", expects)
 
 
-ITS_OWN = r"takes the run's own settings; these differ: "
+ITS_OWN = r"expects the run's own settings; these differ: "
 # The run is whole; `RUN` stands for its folder, `NEW` for the flags that made it.
 RESUMED = [
-    ("--resume=none", "--resume=none:", "takes the folder of a run"),
-    ("--resume=file", "--resume=file:", "takes the folder of a run"),
-    ("--resume=empty", "--resume=empty:", "takes the folder of a run"),
-    ("--resume=runs/ant", "--resume=runs/ant:", "takes the folder of a run"),
-    ("--resume=" + "x" * 300, "--resume=xxx", "takes the folder of a run"),
-    ("--resume=a\0b", "--resume=a\\x00b:", "takes a folder"),
-    ("--resume=RUN --steps=50", "--resume=RUN:", r"takes at least the run's own --steps \(60\)"),
+    ("--resume=none", "--resume=none:", "expects the folder of a run"),
+    ("--resume=file", "--resume=file:", "expects the folder of a run"),
+    ("--resume=empty", "--resume=empty:", "expects the folder of a run"),
+    ("--resume=runs/ant", "--resume=runs/ant:", "expects the folder of a run"),
+    ("--resume=" + "x" * 300, "--resume=xxx", "expects the folder of a run"),
+    ("--resume=a\0b", "--resume=a\\x00b:", "expects a folder"),
+    ("--resume=RUN --steps=50", "--resume=RUN:", r"expects at least the run's own --steps \(60\)"),
     ("--resume=RUN --lr=0.5", "--resume=RUN:", ITS_OWN + "lr .*0.5"),
     ("--resume=RUN --lr=0.5 --seeds=3 --algo=td3", "--resume=RUN:", ITS_OWN + "lr .*, algo .*, seeds "),
-    ("--resume=RUN --env=antt", "--env:", "takes one of"),
+    ("--resume=RUN --env=antt", "--env:", "expects one of"),
     ("--resume=RUN --penalty_coef=0.1,0.2", "--resume=RUN:", ITS_OWN + "penalty_coef"),
     ("--resume=RUN --overwrite", "--overwrite:", "no --resume beside it"),
     ("--resume=RUN --name=run", "--name:", "has no effect with --resume=RUN"),
     ("--resume=RUN --out=runs", "--out:", "has no effect with --resume=RUN"),
     ("--resume=RUN --keep_checkpoints=0", "--keep_checkpoints:", "at least 1"),
-    ("NEW --resume --lr=0.5", "--resume:", "takes its folder: --resume=DIR"),
-    ("NEW --resume --steps=50", "--resume:", "takes its folder: --resume=DIR"),
+    ("NEW --resume --lr=0.5", "--resume:", "expects its folder: --resume=DIR"),
+    ("NEW --resume --steps=50", "--resume:", "expects its folder: --resume=DIR"),
     ("NEW --resume --name=run --lr=0.5", "--resume=RUN:", ITS_OWN + "lr "),
-    ("NEW --resume --out=" + "x" * 300, "--resume:", "takes"),
-    ("NEW --resume --name=run --out=" + "x" * 300, "--out=xxx", "takes a folder"),
+    ("NEW --resume --out=" + "x" * 300, "--resume:", "expects"),
+    ("NEW --resume --name=run --out=" + "x" * 300, "--out=xxx", "expects a folder"),
     ("--resume", "--algo:", "is required"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "begins", "takes"), RESUMED, ids=[short(row[0]) for row in RESUMED])
-def test_a_resume_that_cannot_be_is_refused(folder, capsys, arguments, begins, takes):
+@pytest.mark.parametrize(("arguments", "begins", "expects"), RESUMED, ids=[short(row[0]) for row in RESUMED])
+def test_a_resume_that_cannot_be_is_refused(folder, capsys, arguments, begins, expects):
     text = arguments.replace("RUN", str(RUN)).replace("NEW", NEW)
-    refused(folder, capsys, text.split(" "), begins.replace("RUN", str(RUN)), takes.replace("RUN", str(RUN)))
+    refused(folder, capsys, text.split(" "), begins.replace("RUN", str(RUN)), expects.replace("RUN", str(RUN)))
 
 
 # --overwrite
@@ -410,14 +412,14 @@ NOT_RUNS = [foreign_file, foreign_folder, a_link_below, a_link_itself, a_link_to
 @pytest.mark.parametrize("change", NOT_RUNS, ids=[change.__name__ for change in NOT_RUNS])
 def test_what_is_not_a_run_alone_is_not_replaced(folder, capsys, change):
     change(RUN)
-    takes = "takes a folder with a run alone"
-    refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", takes)
+    expects = "expects a folder with a run alone"
+    refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", expects)
 
 
 def test_a_file_in_a_runs_place_is_not_replaced(folder, capsys):
     shutil.rmtree(RUN)
     RUN.write_text("mine")
-    refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--out=runs:", "takes a folder")
+    refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--out=runs:", "expects a folder")
 
 
 HOLD = """
@@ -435,7 +437,7 @@ def test_a_run_at_which_another_process_is_at_work_is_refused(folder, capsys):
     root = Path(__file__).resolve().parent.parent
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=root) as holder:
         assert holder.stdout.readline() == "locked\n"
-        takes = f"process {holder.pid} is at work on {RUN}; takes another run"
-        refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--name=run:", takes)
-        refused(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", takes)
+        expects = f"process {holder.pid} is at work on {RUN}; expects another run"
+        refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--name=run:", expects)
+        refused(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", expects)
         holder.stdin.close()

@@ -145,7 +145,7 @@ def test_a_wrong_name_is_told_in_one_line_before_anything_runs(flag, value):
     with flagsaver.flagsaver(**{flag: [value]}), pytest.raises(SystemExit) as error:
         bench.main(["bench"])
     message = str(error.value)
-    assert message.startswith(f"--{flag}: takes ") and value in message and "\n" not in message
+    assert message.startswith(f"--{flag}: expects ") and value in message and "\n" not in message
 
 
 @pytest.mark.parametrize("flag", ["tasks", "algos", "members", "devices", "capacities", "physics"])
@@ -153,7 +153,7 @@ def test_a_list_of_nothing_is_refused_but_of_the_suites(flag, monkeypatch):
     bench.FLAGS.mark_as_parsed()
     with flagsaver.flagsaver(suites=[]):
         bench.check_flags()
-    with flagsaver.flagsaver(**{flag: []}), pytest.raises(SystemExit, match=f"^--{flag}: takes at least one$"):
+    with flagsaver.flagsaver(**{flag: []}), pytest.raises(SystemExit, match=f"^--{flag}: expects at least one$"):
         bench.main(["bench"])
 
 
@@ -162,10 +162,12 @@ def test_figures_that_cannot_be_written_are_told_before_and_after(tmp_path):
     bench.FLAGS.mark_as_parsed()
     given = {"suites": ["growth"], "members": ["5"], "figures": str(tmp_path / "file" / "below")}
     with flagsaver.flagsaver(**given):
-        with pytest.raises(SystemExit, match="^--figures=.*/file/below: takes a folder that can be written$"):
+        with pytest.raises(SystemExit, match="^--figures=.*/file/below: expects a folder that can be written$"):
             bench.main(["bench"])
         row = bench.Row("growth", "a", 5, "member updates", 10.0, point=("members", "td3", 5))
-        with pytest.raises(SystemExit, match="^--figures=.*/file/below: takes a folder that can be written: Not a dir"):
+        with pytest.raises(
+            SystemExit, match="^--figures=.*/file/below: expects a folder that can be written: Not a dir"
+        ):
             bench.show([row], 0.0)
 
 
@@ -216,7 +218,7 @@ def test_more_devices_than_there_are_are_refused(monkeypatch):
     try:
         with (
             flagsaver.flagsaver(devices=["1", "99"]),
-            pytest.raises(SystemExit, match=r"^--devices: takes at most \d+ here"),
+            pytest.raises(SystemExit, match=r"^--devices: expects at most \d+ here"),
         ):
             bench.main(["bench"])
     finally:
@@ -228,11 +230,11 @@ def test_more_devices_than_there_are_are_refused(monkeypatch):
     [
         (
             {"suites": ["update", "growth"], "members": ["1", "5"]},
-            "--members: takes one number where growth is measured",
+            "--members: expects one number where growth is measured",
         ),
-        ({"compare": ["sbx"], "algos": ["td7"]}, "--algos: takes some of td3, sac with --compare=sbx"),
-        ({"json": "/no/such/folder/bench.json"}, "--json: takes a file in a folder that is there"),
-        ({"json": "/"}, "--json: takes a file in a folder that is there"),
+        ({"compare": ["sbx"], "algos": ["td7"]}, "--algos: expects some of td3, sac with --compare=sbx"),
+        ({"json": "/no/such/folder/bench.json"}, "--json: expects a file in a folder that is there"),
+        ({"json": "/"}, "--json: expects a file in a folder that is there"),
     ],
 )
 def test_what_would_give_no_rows_or_lose_them_is_refused(given, told):

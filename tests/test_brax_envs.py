@@ -103,17 +103,17 @@ def test_a_run_trains_on_brax(tmp_path):
 def test_the_swimmer_has_one_pipeline_and_takes_it_by_itself():
     assert envs.simulators("brax:swimmer") == ("generalized",)
     assert make_config("td3", "brax:swimmer").physics == "generalized"
-    with pytest.raises(ConfigError, match="--physics: takes one of generalized, not 'mjx' for brax:swimmer"):
+    with pytest.raises(ConfigError, match="--physics: expects one of generalized, not 'mjx' for brax:swimmer"):
         make_config("td3", "brax:swimmer", physics="mjx")
-    with pytest.raises(ConfigError, match="--eval_physics: takes one of auto, generalized, not 'spring'"):
+    with pytest.raises(ConfigError, match="--eval_physics: expects one of auto, generalized, not 'spring'"):
         make_config("td3", "brax:swimmer", eval_physics="spring")
 
 
 @pytest.mark.parametrize(
     ("name", "physics", "message"),
     [
-        ("brax:ant", "mujoco", "physics takes one of mjx, generalized, spring, positional, not 'mujoco'"),
-        ("ant", "spring", "physics takes one of mjx, mujoco, warp, not 'spring'"),
+        ("brax:ant", "mujoco", "physics expects one of mjx, generalized, spring, positional, not 'mujoco'"),
+        ("ant", "spring", "physics expects one of mjx, mujoco, warp, not 'spring'"),
         ("brax:antt", "mjx", "not 'brax:antt'; did you mean brax:ant?"),
     ],
 )

@@ -132,7 +132,7 @@ def test_a_directory_that_holds_a_run_is_refused(finished, capsys):
     assert run(path.parents[2]) == 2
     assert (
         capsys.readouterr().err
-        == f"--name=run: {path} already holds a run; takes another name, or --overwrite replaces it\n"
+        == f"--name=run: {path} already holds a run; expects another name, or --overwrite replaces it\n"
     )
     assert {item: item.stat().st_mtime_ns for item in path.rglob("*")} == before
 
@@ -217,12 +217,12 @@ def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsy
     path.mkdir(parents=True)
     (path / "config.json").write_text("old")
     assert run(tmp_path) == 2
-    assert "already holds a run; takes another name, or --overwrite replaces it" in capsys.readouterr().err
+    assert "already holds a run; expects another name, or --overwrite replaces it" in capsys.readouterr().err
     assert (path / "config.json").read_text() == "old"
     (path / "thesis.tex").write_text("mine")
     assert run(tmp_path, "--overwrite") == 2
     line = capsys.readouterr().err
-    assert line.startswith(f"--overwrite: {path} holds other things than a run; takes ") and line.count("\n") == 1
+    assert line.startswith(f"--overwrite: {path} holds other things than a run; expects ") and line.count("\n") == 1
     assert (path / "config.json").read_text() == "old"
     (path / "thesis.tex").unlink()
     assert run(tmp_path, "--overwrite", "--penalty_coef=0,0.5") == 0
@@ -278,27 +278,27 @@ def test_help_lists_every_group(capsys):
 # What cannot be, and how the one line begins. The typing errors are in test_flags.
 BAD = [
     ("--stepz=5", "--stepz: unknown flag; did you mean --steps?"),
-    ("--steps=two\nlines", "--steps=two\\nlines: takes a whole number"),
-    ("--algo=sac_sqtt", "--algo: takes one of td3, td3_sqt, td3_sqt_tuple, sac, sac_sqt, sac_sqt_tuple, "),
-    ("--env=antt", "--env: takes one of cheetah, walker, ant, humanoid"),
-    ("--algo=sac --penalty_coef=0.5", "--penalty_coef: takes 0 for sac"),
+    ("--steps=two\nlines", "--steps=two\\nlines: expects a whole number"),
+    ("--algo=sac_sqtt", "--algo: expects one of td3, td3_sqt, td3_sqt_tuple, sac, sac_sqt, sac_sqt_tuple, "),
+    ("--env=antt", "--env: expects one of cheetah, walker, ant, humanoid"),
+    ("--algo=sac --penalty_coef=0.5", "--penalty_coef: expects 0 for sac"),
     ("--algo=td3_sqt --temperature=0.1,0.2", "--temperature: has no effect with td3_sqt"),
     (
         "--algo=td3 --preset=released --networks=mlp",
         "--train_encoder: has no effect with --networks=mlp (set by --preset=released)",
     ),
-    ("--algo=td7_sqt --num_envs=2 --steps=100", "--num_envs: takes 1 for td7_sqt"),
-    ("--penalty_coef=-1", "--penalty_coef: takes a number of at least 0"),
-    ("--ensemble_size=1", "--ensemble_size: takes at least 2 for sac_sqt"),
-    ("--ddof=2", "--ddof: takes a number below the ensemble_size (2)"),
-    ("--reduce=max", "--reduce: takes one of min, mean, subset_min"),
-    ("--reduce=subset_min --subset_size=3", "--subset_size: takes at most the ensemble_size (2)"),
-    ("--batch_size=50 --replay_capacity=40", "--batch_size: takes at most the replay's capacity (40)"),
-    ("--warmup_steps=500", "--warmup_steps: takes fewer than the run's steps (120)"),
-    ("--num_envs=7", "--steps: takes a multiple of num_envs (7)"),
-    ("--hidden=0", "--hidden: takes layer widths"),
-    ("--gamma=0.9,1.5", "--gamma: takes a number from 0 to 1"),
-    ("--seeds=0,0", "--seeds: takes each value once"),
+    ("--algo=td7_sqt --num_envs=2 --steps=100", "--num_envs: expects 1 for td7_sqt"),
+    ("--penalty_coef=-1", "--penalty_coef: expects a number of at least 0"),
+    ("--ensemble_size=1", "--ensemble_size: expects at least 2 for sac_sqt"),
+    ("--ddof=2", "--ddof: expects a number below the ensemble_size (2)"),
+    ("--reduce=max", "--reduce: expects one of min, mean, subset_min"),
+    ("--reduce=subset_min --subset_size=3", "--subset_size: expects at most the ensemble_size (2)"),
+    ("--batch_size=50 --replay_capacity=40", "--batch_size: expects at most the replay's capacity (40)"),
+    ("--warmup_steps=500", "--warmup_steps: expects fewer than the run's steps (120)"),
+    ("--num_envs=7", "--steps: expects a multiple of num_envs (7)"),
+    ("--hidden=0", "--hidden: expects layer widths"),
+    ("--gamma=0.9,1.5", "--gamma: expects a number from 0 to 1"),
+    ("--seeds=0,0", "--seeds: expects each value once"),
     ("--steps=2e9 --replay_capacity=2e9", "--replay_capacity=2000000000: 2 members need about"),
     ("--name=" + "x" * 300, "--name=xxxxxx"),
 ]
@@ -317,7 +317,7 @@ def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, l
 def test_unknown_physics_is_refused(tmp_path, capsys):
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--physics=warp9"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("--physics: takes one of mjx, mujoco, warp, not 'warp9'") and err.count("\n") == 1
+    assert err.startswith("--physics: expects one of mjx, mujoco, warp, not 'warp9'") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("flag", ["physics", "eval_physics"])
@@ -325,7 +325,7 @@ def test_physics_that_cannot_run_here_is_refused(tmp_path, capsys, monkeypatch, 
     monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", f"--{flag}=warp"]) == 2
     out, err = capsys.readouterr()
-    assert (out, err) == ("", f"--{flag}: warp needs a part; takes one of mjx, mujoco here\n")
+    assert (out, err) == ("", f"--{flag}: warp needs a part; expects one of mjx, mujoco here\n")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -345,7 +345,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "file") == 2
     err = capsys.readouterr().err
-    assert err.startswith(f"--out={tmp_path / 'file'}: takes a folder that can be written") and err.count("\n") == 1
+    assert err.startswith(f"--out={tmp_path / 'file'}: expects a folder that can be written") and err.count("\n") == 1
 
 
 def test_the_command_itself(tmp_path):

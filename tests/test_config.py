@@ -125,7 +125,7 @@ def test_what_cannot_be_is_refused_by_its_name(setting, settings):
         make_config(taker(settings), "ant", **settings)
     assert error.value.setting == setting
     message = str(error.value)
-    assert message.startswith(f"--{setting}: takes ") and "\n" not in message
+    assert message.startswith(f"--{setting}: expects ") and "\n" not in message
 
 
 def test_every_limited_setting_is_among_the_refused():
@@ -151,13 +151,13 @@ def test_the_edges_of_the_limits_are_taken(settings):
 
 
 def test_a_plain_algorithm_takes_no_penalty():
-    with pytest.raises(ConfigError, match="--penalty_coef: takes 0 for td3, .* _sqt and _sqt_tuple"):
+    with pytest.raises(ConfigError, match="--penalty_coef: expects 0 for td3, .* _sqt and _sqt_tuple"):
         make_config("td3", "ant", penalty_coef=0.5)
     assert make_config("td3", "ant", penalty_coef=0).agent.penalty_coef == 0
 
 
 def test_a_plain_algorithms_ddof_is_that_of_the_disagreement_it_reports():
-    with pytest.raises(ConfigError, match="--ddof: takes a number below the ensemble_size .2."):
+    with pytest.raises(ConfigError, match="--ddof: expects a number below the ensemble_size .2."):
         make_config("td3", "ant", ddof=2)
 
 
@@ -200,7 +200,7 @@ def test_a_setting_without_effect_on_these_networks_is_refused(networks, setting
 
 
 def test_the_temperature_is_fixed_with_sale_networks():
-    with pytest.raises(ConfigError, match="--temperature: takes a number with --networks=sale, not auto$"):
+    with pytest.raises(ConfigError, match="--temperature: expects a number with --networks=sale, not auto$"):
         make_config("sac", "ant", networks="sale", learn_temperature=True)
 
 
@@ -217,7 +217,7 @@ def test_a_learned_temperature_is_refused_by_the_flags_name():
         ({"Gamma": 0.9}, "Gamma", "did you mean gamma?"),
         ({"zzz": 1}, "zzz", "is not a setting"),
         ({"algo": "sac_sqtt"}, "algo", "did you mean sac_sqt?"),
-        ({"algo": "ppo"}, "algo", "takes one of td3, td3_sqt, "),
+        ({"algo": "ppo"}, "algo", "expects one of td3, td3_sqt, "),
         ({"env": "humanoidd"}, "env", "did you mean humanoid?"),
     ],
     ids=str,
@@ -286,5 +286,5 @@ def test_scalars_are_the_settings_of_their_names():
 
 
 def test_an_error_reaches_another_process_whole():
-    error = pickle.loads(pickle.dumps(ConfigError("steps", "takes a whole number")))
-    assert (type(error), error.setting, str(error)) == (ConfigError, "steps", "--steps: takes a whole number")
+    error = pickle.loads(pickle.dumps(ConfigError("steps", "expects a whole number")))
+    assert (type(error), error.setting, str(error)) == (ConfigError, "steps", "--steps: expects a whole number")

@@ -23,11 +23,11 @@ def test_lines_are_arguments(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("steps: 1\nsteps: 2", "takes each setting once, not steps 2 times"),
-        ("steps: {a: 1, a: 2}", "takes each setting once, not a 2 times"),
+        ("steps: 1\nsteps: 2", "expects each setting once, not steps 2 times"),
+        ("steps: {a: 1, a: 2}", "expects each setting once, not a 2 times"),
         ("config: other.yaml", "config is for the command line"),
-        ("steps: []", "steps takes a number, a word or a list of them"),
-        ("steps", "takes lines like `steps: 100000`"),
+        ("steps: []", "steps expects a number, a word or a list of them"),
+        ("steps", "expects lines like `steps: 100000`"),
     ],
 )
 def test_others_are_refused(tmp_path, text, message):
@@ -39,6 +39,9 @@ def test_others_are_refused(tmp_path, text, message):
 
 
 def test_no_file(tmp_path):
-    for path, message in ((tmp_path / "none", "there is no such file"), (tmp_path, "takes a file, which this is not")):
+    for path, message in (
+        (tmp_path / "none", "there is no such file"),
+        (tmp_path, "expects a file, which this is not"),
+    ):
         with pytest.raises(config_file.Refused, match=message):
             config_file.arguments(path)

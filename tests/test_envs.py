@@ -236,7 +236,7 @@ def test_versions_of_names_and_aliases(alias, name):
 
 @pytest.mark.parametrize("name", ["ant-v3", "ant-v6", "ant-v", "ant-v5-v5", "-v5", ""])
 def test_other_versions_are_unknown(name):
-    with pytest.raises(ValueError, match="takes one of cheetah, "):
+    with pytest.raises(ValueError, match="expects one of cheetah, "):
         envs.resolve(name)
 
 
@@ -247,5 +247,5 @@ def test_an_unknown_task_is_told_with_all_names_and_the_nearest(call):
 
 
 def test_an_unknown_simulator_is_told_with_all_names_and_the_nearest():
-    with pytest.raises(ValueError, match=r"physics takes one of mjx.*'mjxx'; did you mean mjx\?"):
+    with pytest.raises(ValueError, match=r"physics expects one of mjx.*'mjxx'; did you mean mjx\?"):
         envs.make("ant", physics="mjxx")

@@ -125,5 +125,5 @@ def test_no_ffmpeg_is_told(monkeypatch):
 
 @pytest.mark.parametrize("name", ["film", "film.avi", ".mp4", "film.mp4.txt", ""])
 def test_files_of_other_kinds_are_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="takes a file with the ending .mp4, .gif, .html"):
+    with pytest.raises(ValueError, match="expects a file with the ending .mp4, .gif, .html"):
         films.format_of(tmp_path / name if name else tmp_path.__class__(""))

@@ -26,7 +26,7 @@ def test_folders_with_evaluations_alone_are_named(tmp_path):
 def test_folders_in_which_there_is_no_run_are_named(tmp_path):
     path = write_run(tmp_path / "a")
     for text, message in [
-        (str(tmp_path / "none"), "there is no such folder; RUNS takes folders of runs or folders above them"),
+        (str(tmp_path / "none"), "there is no such folder; RUNS expects folders of runs or folders above them"),
         (str(path / "config.json"), "is no folder"),
     ]:
         with pytest.raises(UsageError) as error:

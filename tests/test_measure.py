@@ -75,8 +75,8 @@ def test_fewer_members_than_devices_give_no_row_and_a_line(capsys):
     assert list(measure.bench_updates("td3", "cheetah", 1, (2, 4), **SHORT)) == []
     assert list(measure.bench_loops("td3", "cheetah", 1, ["mjx"], (2,), **SHORT)) == []
     assert capsys.readouterr().out.splitlines() == [
-        "no figure of 1 members on 2 or 4 devices: each takes one at least",
-        "no figure of 1 members on 2 devices: each takes one at least",
+        "no figure of 1 members on 2 or 4 devices: each expects one at least",
+        "no figure of 1 members on 2 devices: each expects one at least",
     ]
 
 

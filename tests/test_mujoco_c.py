@@ -214,7 +214,7 @@ def test_a_forked_child_has_threads_of_its_own():
 
 
 def test_no_threads_are_refused():
-    with pytest.raises(ValueError, match="num_threads takes at least 1, not 0"):
+    with pytest.raises(ValueError, match="num_threads expects at least 1, not 0"):
         mujoco_c.make(setup_of("ant"), num_threads=0)
 
 

@@ -74,7 +74,7 @@ def test_wrong_names_are_told_in_one_line(flag, value):
     parity.FLAGS.mark_as_parsed()
     with flagsaver.flagsaver(**{flag: [value]}), pytest.raises(SystemExit) as error:
         parity.main(["parity"])
-    assert str(error.value).startswith(f"--{flag}: takes some of ") and "\n" not in str(error.value)
+    assert str(error.value).startswith(f"--{flag}: expects some of ") and "\n" not in str(error.value)
 
 
 OTHERS = ["suites", "suite", "algos", "members", "devices", "capacities", "profile", "figures", "compare", "json"]
@@ -85,7 +85,9 @@ def test_flags_that_the_benchmark_alone_has_a_use_for_are_refused(name):
     parity.FLAGS.mark_as_parsed()
     parity.FLAGS[name].present = 1
     try:
-        with pytest.raises(SystemExit, match=f"^--{name}: has no effect here; takes of the benchmark's flags --tasks"):
+        with pytest.raises(
+            SystemExit, match=f"^--{name}: has no effect here; expects of the benchmark's flags --tasks"
+        ):
             parity.main(["parity"])
     finally:
         parity.FLAGS[name].present = 0
@@ -102,8 +104,8 @@ def test_a_report_that_cannot_be_written_is_refused_before_anything_runs(tmp_pat
     parity.FLAGS.mark_as_parsed()
     (tmp_path / "file").write_text("")
     for out, told in {
-        tmp_path: "takes a file, which this folder",
-        tmp_path / "file" / "a.md": "takes a file in",
+        tmp_path: "expects a file, which this folder",
+        tmp_path / "file" / "a.md": "expects a file in",
     }.items():
         with flagsaver.flagsaver(out=str(out)), pytest.raises(SystemExit, match=f"^--out={out}: {told}"):
             parity.main(["parity"])

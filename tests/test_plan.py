@@ -1,4 +1,4 @@
-"""From a command line to a run: which one --resume goes on with, and which of its own flags it takes over."""
+"""From a command line to a run: which one --resume goes on with, and which of its own flags it expects over."""
 
 import json
 
@@ -140,13 +140,13 @@ def test_given_flags_win_over_the_runs_and_these_over_the_defaults(tmp_path, its
 def test_the_default_checkpoints_fit_the_environments(tmp_path):
     made = plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--name=a")
     assert made.output["checkpoint_every"] == 24_999
-    with pytest.raises(flags.UsageError, match=r"^--checkpoint_every: takes a multiple of num_envs \(3\), not 20$"):
+    with pytest.raises(flags.UsageError, match=r"^--checkpoint_every: expects a multiple of num_envs \(3\), not 20$"):
         plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--checkpoint_every=20", "--name=a")
 
 
 def test_a_run_that_is_in_the_way_is_refused_unless_it_is_to_be_replaced(tmp_path):
     path = begun(tmp_path, "a")
-    with pytest.raises(flags.UsageError, match="^--name=a: .* takes another name, or --overwrite replaces it$"):
+    with pytest.raises(flags.UsageError, match="^--name=a: .* expects another name, or --overwrite replaces it$"):
         plan(tmp_path, "--name=a")
     assert plan(tmp_path, "--name=a", "--overwrite").path == path
     assert json.loads((path / "config.json").read_text())["preset"] == "paper"  # a plan removes nothing
@@ -157,7 +157,7 @@ def test_a_run_that_is_in_the_way_is_refused_unless_it_is_to_be_replaced(tmp_pat
 
 def test_there_is_no_device_without_a_member(tmp_path, monkeypatch):
     monkeypatch.setattr(jax, "local_devices", lambda: jax.devices() * 4)
-    with pytest.raises(flags.UsageError, match=r"^--devices=3: takes at most one for each of 2 members$"):
+    with pytest.raises(flags.UsageError, match=r"^--devices=3: expects at most one for each of 2 members$"):
         plan(tmp_path, "--seeds=0,1", "--devices=3", "--name=a")
     assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4
 
@@ -173,6 +173,6 @@ def test_devices_that_nobody_named_are_chosen_anew_where_a_run_goes_on(tmp_path,
     assert len(plan(tmp_path, f"--resume={path}", new="").layout.devices) == 1
     with pytest.raises(flags.UsageError, match="^--devices=2: .* 1 here, and the run was started with more$"):
         plan(tmp_path, f"--resume={named}", new="")
-    with pytest.raises(flags.UsageError, match="^--devices=2: takes at most 1 here$"):
+    with pytest.raises(flags.UsageError, match="^--devices=2: expects at most 1 here$"):
         plan(tmp_path, f"--resume={named}", "--devices=2", new="")
     assert len(plan(tmp_path, f"--resume={named}", "--devices=1", new="").layout.devices) == 1

@@ -40,9 +40,9 @@ def test_what_there_is_nothing_of_is_said(runs, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "RUNS: takes folders of runs"),
-        (["runs", "--format=gif"], "--format: takes one of png, svg, pdf, not 'gif'"),
-        (["runs", "--statistic=median"], "--statistic: takes one of iqm, mean, not 'median'"),
+        ([], "RUNS: expects folders of runs"),
+        (["runs", "--format=gif"], "--format: expects one of png, svg, pdf, not 'gif'"),
+        (["runs", "--statistic=median"], "--statistic: expects one of iqm, mean, not 'median'"),
         (["runs", "--overwite"], "--overwite: unknown flag; did you mean --overwrite?"),
         (["none"], "none: there is no such folder"),
     ],

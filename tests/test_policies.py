@@ -47,9 +47,9 @@ def test_the_best_is_chosen_of_those_that_are_asked_for(run, returns, asked, mem
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
-        ({"seed": 4}, "--seed=4: takes a seed of the run, one of 3, 5"),
-        ({"number": 4}, "--member=4: takes one of the run's members, 0 to 3"),
-        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; takes --seed or --member"),
+        ({"seed": 4}, "--seed=4: expects a seed of the run, one of 3, 5"),
+        ({"number": 4}, "--member=4: expects one of the run's members, 0 to 3"),
+        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; expects --seed or --member"),
     ],
 )
 def test_members_that_the_run_has_not(run, asked, says):
@@ -114,7 +114,7 @@ def other_sizes(path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (no_policy, "takes a run with a policy, which is saved when training ends; it has none yet"),
+        (no_policy, "expects a run with a policy, which is saved when training ends; it has none yet"),
         (no_member, "member_1.npz: there is no such file"),
         (damaged, "member_1.npz: not the parameters of a policy"),
         (other_sizes, "policy: is not a policy for hopper: its sizes are 2 and 1"),
@@ -131,5 +131,5 @@ def test_a_policy_that_cannot_be_played_is_refused_in_a_line(run, tmp_path, chan
 
 
 def test_what_is_no_run_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="takes the folder of a run; it has no config.json that can be read"):
+    with pytest.raises(UsageError, match="expects the folder of a run; it has no config.json that can be read"):
         policies.read(tmp_path)

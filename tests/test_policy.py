@@ -74,7 +74,7 @@ def test_a_missing_member_is_named(tmp_path):
         policy.load_policy(tmp_path / "policy", member=7)
 
 
-# A folder that was made to do harm, or came to it. Damage takes the folder.
+# A folder that was made to do harm, or came to it. Damage expects the folder.
 
 
 class Touch:
@@ -106,7 +106,7 @@ def without(key):
 
 
 def parameters(change, save=np.savez):
-    """`change` takes the arrays of member 0 by name, and gives others."""
+    """`change` expects the arrays of member 0 by name, and gives others."""
 
     def damage(folder):
         with np.load(folder / "member_0.npz") as file:

@@ -31,7 +31,7 @@ def test_the_same_seed_twice_is_refused(tmp_path):
     one, two = write_run(tmp_path / "a", seeds=[3]), write_run(tmp_path / "b", seeds=[3])
     with pytest.raises(UsageError) as error:
         collect([str(tmp_path)])
-    message = f"{one} and {two}: both hold seed 3 of td3 on cheetah with the same settings; takes one of them"
+    message = f"{one} and {two}: both hold seed 3 of td3 on cheetah with the same settings; expects one of them"
     assert str(error.value) == message
 
 

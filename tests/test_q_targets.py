@@ -278,7 +278,7 @@ def test_shapes_that_would_broadcast_to_something_else_are_refused(maybe_jit, sh
 
 @pytest.mark.parametrize("size", [0, 3])
 def test_a_subset_of_more_critics_than_there_are_is_refused(size):
-    with pytest.raises(ValueError, match=f"takes 1 to 2 of the critics, not {size}"):
+    with pytest.raises(ValueError, match=f"expects 1 to 2 of the critics, not {size}"):
         q_targets.random_subset(jax.random.key(0), 2, size)
 
 

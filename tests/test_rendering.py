@@ -84,5 +84,5 @@ def test_a_model_without_that_camera_is_followed_all_the_same():
 
 def test_a_camera_that_the_model_has_not_is_refused():
     model = load_model(TASKS["ant"])
-    with pytest.raises(ValueError, match="takes one of track, not 'side'"):
+    with pytest.raises(ValueError, match="expects one of track, not 'side'"):
         next(rendering.frames(model, [model.qpos0], camera="side"))

@@ -44,7 +44,7 @@ def test_it_is_replaced_only_where_asked(runs, tmp_path, capsys):
     out.write_text("mine")
     assert main(["report", str(runs), f"--out={out}"]) == 2
     assert capsys.readouterr().err == (
-        f"--out={out}: is there already; takes another file, or --overwrite replaces it\n"
+        f"--out={out}: is there already; expects another file, or --overwrite replaces it\n"
     )
     assert out.read_text() == "mine"
     assert main(["report", str(runs), f"--out={out}", "--overwrite"]) == 0
@@ -72,12 +72,12 @@ def test_what_a_run_says_is_never_markup(runs, tmp_path):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "RUNS: takes folders of runs or folders above them, as in python -m experiments.report"),
+        ([], "RUNS: expects folders of runs or folders above them, as in python -m experiments.report"),
         (["none"], "none: there is no such folder"),
-        (["runs", "--out="], "--out: takes a file"),
-        (["runs", "--out=runs"], "--out=runs: takes a file, which this folder is not"),
-        (["runs", "--out=runs/cheetah/td3/run/config.json/x"], "takes a file"),
-        (["runs", "--statistic=median"], "--statistic: takes one of iqm, mean, not 'median'"),
+        (["runs", "--out="], "--out: expects a file"),
+        (["runs", "--out=runs"], "--out=runs: expects a file, which this folder is not"),
+        (["runs", "--out=runs/cheetah/td3/run/config.json/x"], "expects a file"),
+        (["runs", "--statistic=median"], "--statistic: expects one of iqm, mean, not 'median'"),
         (["runs", "--referense"], "--referense: unknown flag; did you mean --reference?"),
     ],
 )

@@ -161,7 +161,7 @@ def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert resume(tmp_path, "--checkpoint_every=20") == 2
-    assert "takes a run with checkpoints to go on from; it has none" in capsys.readouterr().err
+    assert "expects a run with checkpoints to go on from; it has none" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
@@ -175,7 +175,7 @@ def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached,
     with pytest.raises(UsageError) as error:
         experiments.run._refuse_to_begin_again(path, 50)
     assert str(error.value) == (
-        f"--resume={path}: takes a run with checkpoints to go on from; it has none, and its evaluations reach step "
+        f"--resume={path}: expects a run with checkpoints to go on from; it has none, and its evaluations reach step "
         "150; remove the folder to begin anew"
     )
 
@@ -188,10 +188,10 @@ def test_tables_of_a_resumed_run_that_cannot_be_written_are_named_by_its_flag(tm
     options = SimpleNamespace(out="runs")
     plan = SimpleNamespace(path=tmp_path, resumed=True, options=options, members=[], swept=[])
     plan.output = {"tensorboard": True}
-    with pytest.raises(UsageError, match=f"^--resume={tmp_path}: takes a folder that can be written: .*Read-only"):
+    with pytest.raises(UsageError, match=f"^--resume={tmp_path}: expects a folder that can be written: .*Read-only"):
         experiments.run._tables(plan, None, print)
     plan.resumed = None
-    with pytest.raises(UsageError, match="^--out=runs: takes a folder that can be written: .*Read-only"):
+    with pytest.raises(UsageError, match="^--out=runs: expects a folder that can be written: .*Read-only"):
         experiments.run._tables(plan, None, print)
 
 
@@ -243,7 +243,7 @@ def test_steps_that_cannot_be_are_refused_and_the_run_stays_as_it_was(tmp_path, 
     assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert resume(tmp_path, "--steps=141") == 2
-    assert capsys.readouterr().err.startswith("--steps: takes a multiple of num_envs (2), not 141")
+    assert capsys.readouterr().err.startswith("--steps: expects a multiple of num_envs (2), not 141")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 

@@ -196,7 +196,7 @@ def test_a_run_that_cannot_be_gone_on_with_is_refused_and_left_as_it_is(
     assert run(f"--resume={path}", "--steps=80", "--quiet") == 2
     out, err = capsys.readouterr()
     assert len(out.splitlines()) == said and err.count("\n") == 1
-    assert err.startswith(f"--resume={path}: takes a run with checkpoints to go on from; ") and reason in err
+    assert err.startswith(f"--resume={path}: expects a run with checkpoints to go on from; ") and reason in err
     lock = path / "lock"
     assert {item: text for item, text in contents(tmp_path).items() if item != lock} == {
         item: text for item, text in before.items() if item != lock

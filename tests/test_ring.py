@@ -147,7 +147,7 @@ def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
 @pytest.mark.parametrize("width", [1, 3, 4])
 def test_other_than_one_transition_per_environment_is_refused(width):
     ring = Ring(CAPACITY, O, A, num_envs=2)
-    with pytest.raises(ValueError, match=r"takes transitions of {'obs': \(2, "):
+    with pytest.raises(ValueError, match=r"expects transitions of {'obs': \(2, "):
         ring.insert(ring.init(), Stream(width).step(np.zeros(width, bool)))
 
 
@@ -157,7 +157,7 @@ def test_transitions_of_other_sizes_are_refused(field):
     ring, one = Ring(CAPACITY, O, A), Stream(1).step(np.zeros(1, bool))
     ring.insert(ring.init(), one)
     narrow = one._replace(**{field: getattr(one, field)[..., :0] if field in ("obs", "action", "next_obs") else 0.0})
-    with pytest.raises(ValueError, match=rf"takes transitions of .*, not .*'{field}': \("):
+    with pytest.raises(ValueError, match=rf"expects transitions of .*, not .*'{field}': \("):
         ring.insert(ring.init(), narrow)
 
 

@@ -156,12 +156,12 @@ def test_a_diverged_member_does_not(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("", "--preset: takes one of table2, table3, table4, all, alpha\n"),
-        ("--preset=table2 --algos=td4", "--algos: takes one of td3, "),
-        ("--preset=table2 --tasks=antt", "--tasks: takes one of cheetah, "),
+        ("", "--preset: expects one of table2, table3, table4, all, alpha\n"),
+        ("--preset=table2 --algos=td4", "--algos: expects one of td3, "),
+        ("--preset=table2 --tasks=antt", "--tasks: expects one of cheetah, "),
         (
             "--preset=table2 --name=x",
-            "--name=x: takes flags of experiments.run in the form --flag=value, but for --algo",
+            "--name=x: expects flags of experiments.run in the form --flag=value, but for --algo",
         ),
         ("--preset=table2 --tasks=ant --stepz=4", "--stepz: unknown flag; did you mean --steps?"),
     ],

@@ -65,11 +65,11 @@ def test_every_format_is_written_and_replaced_only_where_asked(runs, tmp_path, c
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "RUNS: takes folders of runs"),
+        ([], "RUNS: expects folders of runs"),
         (["none"], "none: there is no such folder"),
-        (["runs", "--format=html"], "--format: takes one of terminal, markdown, csv, latex, not 'html'"),
+        (["runs", "--format=html"], "--format: expects one of terminal, markdown, csv, latex, not 'html'"),
         (["runs", "--referense"], "--referense: unknown flag; did you mean --reference?"),
-        (["runs", "--out=runs/cheetah/td3/run/config.json"], "takes a folder, which this is not"),
+        (["runs", "--out=runs/cheetah/td3/run/config.json"], "expects a folder, which this is not"),
     ],
 )
 def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):

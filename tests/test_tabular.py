@@ -20,35 +20,37 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
     assert sorted(path.name for path in out.iterdir()) == ["table.md", "tabular.png"]
 
     assert tabular.main([*argv, f"--out={out}"]) == 2
-    assert capsys.readouterr().err == f"--out={out}: is there already; takes another folder, or --overwrite beside it\n"
+    assert (
+        capsys.readouterr().err == f"--out={out}: is there already; expects another folder, or --overwrite beside it\n"
+    )
     assert tabular.parse([*argv, f"--out={out}", "--overwrite"])["overwrite"]
 
 
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("--mdps=maze", "--mdps: takes one of random, chain, grid, not 'maze'"),
-        ("--mdps=", "--mdps: takes at least one"),
-        ("--algos=q_learning,sarsa", "--algos: takes one of q_learning, "),
-        ("--coefs=0,-1", "--coefs: takes numbers of at least 0 like 0,0.5, not '-1'"),
-        ("--coefs=nan", "--coefs: takes numbers of at least 0"),
-        ("--coefs=0,0.0", "--coefs: takes each value once, 0.0 is there 2 times"),
-        ("--seeds=0", "--seeds: takes an integer in the range [1, 10000]"),
-        ("--seeds=many", "--seeds: takes an integer in the range [1, 10000]"),
-        ("--steps=1", "--steps: takes an integer in the range [100, 100000000]"),
-        ("--tables=1", "--tables: takes an integer in the range [2, 100]"),
-        ("--greedy=max", "--greedy: takes one of min, mean, penalised, not 'max'"),
-        ("--gamma=1", "--gamma: takes a number above 0 and below 1, not 1"),
-        ("--gamma=0", "--gamma: takes a number above 0 and below 1, not 0"),
-        ("--gamma=nan", "--gamma: takes a number"),
-        ("--lr_power=0.5", "--lr_power: takes a number above 0.5 and up to 1, not 0.5"),
-        ("--epsilon=2", "--epsilon: takes a number in the range [0.0, 1.0]"),
-        ("--weighted_c=0", "--weighted_c: takes a number above 0, not 0"),
-        ("--overwrite=3", "--overwrite: takes true or false"),
-        ("--out=", "--out: takes a folder"),
-        (f"--out={__file__}", f"--out={__file__}: takes a folder, which this is not"),
-        (f"--out={__file__}/below", f"--out={__file__}/below: takes a folder that can be written"),
-        ("--out=" + "x" * 300, f"--out={'x' * 300}: takes a folder that can be written"),
+        ("--mdps=maze", "--mdps: expects one of random, chain, grid, not 'maze'"),
+        ("--mdps=", "--mdps: expects at least one"),
+        ("--algos=q_learning,sarsa", "--algos: expects one of q_learning, "),
+        ("--coefs=0,-1", "--coefs: expects numbers of at least 0 like 0,0.5, not '-1'"),
+        ("--coefs=nan", "--coefs: expects numbers of at least 0"),
+        ("--coefs=0,0.0", "--coefs: expects each value once, 0.0 is there 2 times"),
+        ("--seeds=0", "--seeds: expects an integer in the range [1, 10000]"),
+        ("--seeds=many", "--seeds: expects an integer in the range [1, 10000]"),
+        ("--steps=1", "--steps: expects an integer in the range [100, 100000000]"),
+        ("--tables=1", "--tables: expects an integer in the range [2, 100]"),
+        ("--greedy=max", "--greedy: expects one of min, mean, penalised, not 'max'"),
+        ("--gamma=1", "--gamma: expects a number above 0 and below 1, not 1"),
+        ("--gamma=0", "--gamma: expects a number above 0 and below 1, not 0"),
+        ("--gamma=nan", "--gamma: expects a number"),
+        ("--lr_power=0.5", "--lr_power: expects a number above 0.5 and up to 1, not 0.5"),
+        ("--epsilon=2", "--epsilon: expects a number in the range [0.0, 1.0]"),
+        ("--weighted_c=0", "--weighted_c: expects a number above 0, not 0"),
+        ("--overwrite=3", "--overwrite: expects true or false"),
+        ("--out=", "--out: expects a folder"),
+        (f"--out={__file__}", f"--out={__file__}: expects a folder, which this is not"),
+        (f"--out={__file__}/below", f"--out={__file__}/below: expects a folder that can be written"),
+        ("--out=" + "x" * 300, f"--out={'x' * 300}: expects a folder that can be written"),
         ("--stepz=5", "--stepz: unknown flag; did you mean --steps?"),
         ("--flagfile=x", "--flagfile: unknown flag"),
         ("5", "5: unexpected argument"),
@@ -65,7 +67,7 @@ def test_a_wrong_flag_is_told_in_one_line_before_anything_runs(argument, message
 def test_a_folder_in_the_place_of_a_result_is_refused_before_anything_runs(tmp_path, capsys):
     (tmp_path / "tabular.png").mkdir()
     assert tabular.main(["tabular", f"--out={tmp_path}", "--overwrite"]) == 2
-    assert capsys.readouterr().err.startswith(f"--out={tmp_path}: tabular.png is a folder; takes a folder without it")
+    assert capsys.readouterr().err.startswith(f"--out={tmp_path}: tabular.png is a folder; expects a folder without it")
 
 
 def test_help_names_every_flag(capsys):

@@ -272,7 +272,7 @@ def test_past_the_switch_of_gradient_steps_one_episode_does_not_end_an_assessmen
 
 
 def test_episodes_of_several_environments_are_refused(three_policies):
-    with pytest.raises(ValueError, match=r"td7 takes one environment: .* not \(2,\)"):
+    with pytest.raises(ValueError, match=r"td7 expects one environment: .* not \(2,\)"):
         AGENT.observe(three_policies, jnp.array([5.0, 6.0]), jnp.array([True, False]))
 
 

@@ -64,7 +64,7 @@ def test_episodes_are_shown_in_turn_until_the_window_is_closed():
         now.time += seconds
 
     def clock():
-        now.time += 0.002  # what drawing takes
+        now.time += 0.002  # what drawing expects
         return now.time
 
     episodes = [states([1, 2, 3]), states([11, 12])]
@@ -79,7 +79,7 @@ def test_a_camera_can_be_named():
     window = Window(pictures=1)
     viewer.show(MODEL, [states([1])], 0.008, "track", launch=window.launch, sleep=lambda seconds: None)
     assert (window.cam.type, window.cam.fixedcamid) == (mujoco.mjtCamera.mjCAMERA_FIXED, MODEL.camera("track").id)
-    with pytest.raises(ValueError, match="takes one of track"):
+    with pytest.raises(ValueError, match="expects one of track"):
         viewer.show(MODEL, [states([1])], 0.008, "side", launch=window.launch)
 
 

@@ -32,7 +32,9 @@ BATCH = 256
 MEGABYTES = "MB"
 NO_SETTINGS: Mapping[str, Any] = MappingProxyType({})
 LOOP_ROWS = 1_000_000  # of the replays of all members together, where a loop is measured
-LARGE = 8e9  # bytes on the device, of loops that are measured in turns: what takes more is measured one after the other
+LARGE = (
+    8e9  # bytes on the device, of loops that are measured in turns: what expects more is measured one after the other
+)
 PROFILED = 4  # lockstep steps; the actor learns in half of them
 
 
@@ -239,7 +241,7 @@ def fitting(devices: Sequence[int | None], members: int) -> list[int]:
     found = [count for count in dict.fromkeys(chosen) if count <= members]
     if not found:
         numbers = " or ".join(map(str, chosen))
-        print(f"no figure of {members} members on {numbers} devices: each takes one at least", flush=True)
+        print(f"no figure of {members} members on {numbers} devices: each expects one at least", flush=True)
     return found
 
 

@@ -1,4 +1,4 @@
-"""The memory that a run takes at its height: `python -m experiments.bench --suites=memory --tasks=humanoid`.
+"""The memory that a run expects at its height: `python -m experiments.bench --suites=memory --tasks=humanoid`.
 
 Each case is a process of its own, since a process's highest memory never falls.
 """

@@ -21,10 +21,10 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with this repository's messages: one line, `--flag: takes ...`.
+    """argparse with this repository's messages: one line, `--flag: expects ...`.
 
     Args:
-      one: whether it takes the folder of one run, `RUN`, and not any number of `RUNS`.
+      one: whether it expects the folder of one run, `RUN`, and not any number of `RUNS`.
     """
 
     def __init__(self, description: str, example: str, one: bool = False):
@@ -50,9 +50,9 @@ class Parser(argparse.ArgumentParser):
                 f"{name}: unknown flag{f'; did you mean {near[0]}?' if near else '; --help lists the flags'}"
             )
         if self.one and len(options.runs) != 1:
-            raise UsageError(f"RUN: takes the folder of one run, as in {self.example}")
+            raise UsageError(f"RUN: expects the folder of one run, as in {self.example}")
         if not options.runs:
-            raise UsageError(f"RUNS: takes folders of runs or folders above them, as in {self.example}")
+            raise UsageError(f"RUNS: expects folders of runs or folders above them, as in {self.example}")
         return options
 
     def error(self, message: str) -> NoReturn:
@@ -60,61 +60,61 @@ class Parser(argparse.ArgumentParser):
         if "expected one argument" in rest:
             rest = _takes(next(action for action in self._actions if flag in action.option_strings))
         elif "ignored explicit argument" in rest:
-            rest = "is a switch and takes no value"
+            rest = "is a switch and expects no value"
         raise UsageError(f"{flag}: {rest}" if rest else message)
 
 
 def _takes(action: argparse.Action) -> str:
-    """What a flag takes, as its type says of no text at all."""
+    """What a flag expects, as its type says of no text at all."""
     try:
         if callable(action.type):
             action.type("")
     except argparse.ArgumentTypeError as error:
         return str(error).removesuffix(", not ''")
-    return f"takes a {str(action.metavar).lower()}"
+    return f"expects a {str(action.metavar).lower()}"
 
 
 def one_of(*choices: str) -> Callable[[str], str]:
-    """The type of a flag that takes one of a few words."""
+    """The type of a flag that expects one of a few words."""
 
     def parse(text: str) -> str:
         if text not in choices:
-            raise argparse.ArgumentTypeError(f"takes one of {', '.join(choices)}, not {text!r}")
+            raise argparse.ArgumentTypeError(f"expects one of {', '.join(choices)}, not {text!r}")
         return text
 
     return parse
 
 
 def whole(text: str) -> int:
-    """The type of a flag that takes a whole number of at least 0."""
+    """The type of a flag that expects a whole number of at least 0."""
     if not (text.isascii() and text.isdecimal()):
-        raise argparse.ArgumentTypeError(f"takes a whole number of at least 0, not {text!r}")
+        raise argparse.ArgumentTypeError(f"expects a whole number of at least 0, not {text!r}")
     return int(text)
 
 
 def between(low: int, high: int) -> Callable[[str], int]:
-    """The type of a flag that takes a whole number from `low` to `high`."""
+    """The type of a flag that expects a whole number from `low` to `high`."""
 
     def parse(text: str) -> int:
         # Python refuses to read far more digits than any limit has
         if not (text.isascii() and text.isdecimal() and len(text) < 20 and low <= int(text) <= high):
-            raise argparse.ArgumentTypeError(f"takes a whole number from {low} to {high}, not {text[:50]!r}")
+            raise argparse.ArgumentTypeError(f"expects a whole number from {low} to {high}, not {text[:50]!r}")
         return int(text)
 
     return parse
 
 
 def folder(text: str) -> Path:
-    """The type of a flag that takes a folder, which need not be there."""
+    """The type of a flag that expects a folder, which need not be there."""
     if not text or "\0" in text:
-        raise argparse.ArgumentTypeError("takes a folder")
+        raise argparse.ArgumentTypeError("expects a folder")
     return Path(text)
 
 
 def file(text: str) -> Path:
-    """The type of a flag that takes a file, which need not be there."""
+    """The type of a flag that expects a file, which need not be there."""
     if not Path(text).name or text.endswith("/") or "\0" in text:
-        raise argparse.ArgumentTypeError("takes a file")
+        raise argparse.ArgumentTypeError("expects a file")
     return Path(text)
 
 
@@ -123,21 +123,23 @@ def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
     refuse_folder("--out", out)
     there = [name for name in names if (out / name).exists() or (out / name).is_symlink()]
     if there and not overwrite:
-        raise UsageError(f"--out={out}: {there[0]} is there already; takes another folder, or --overwrite replaces it")
+        raise UsageError(
+            f"--out={out}: {there[0]} is there already; expects another folder, or --overwrite replaces it"
+        )
     for name in there:
         if (out / name).is_dir():
-            raise UsageError(f"--out={out}: {name} is a folder; takes a folder without it")
+            raise UsageError(f"--out={out}: {name} is a folder; expects a folder without it")
 
 
 def refuse_folder(flag: str, path: Path) -> None:
     """Raises `UsageError` where a folder could not be made or written later."""
     try:
         if path.exists() and not path.is_dir():
-            raise UsageError(f"{flag}={path}: takes a folder, which this is not")
+            raise UsageError(f"{flag}={path}: expects a folder, which this is not")
         if not _can_be_written(path):
-            raise UsageError(f"{flag}={path}: takes a folder that can be written")
+            raise UsageError(f"{flag}={path}: expects a folder that can be written")
     except OSError as error:  # a name that is too long
-        raise UsageError(f"{flag}={path}: takes a folder that can be written: {error.strerror}") from None
+        raise UsageError(f"{flag}={path}: expects a folder that can be written: {error.strerror}") from None
 
 
 def _can_be_written(folder: Path) -> bool:
@@ -157,20 +159,20 @@ def write_file(out: Path, content: bytes) -> None:
 
 
 def _unwritable(out: Path, error: OSError) -> UsageError:
-    return UsageError(f"--out={out}: takes a file that can be written: {error.strerror}")
+    return UsageError(f"--out={out}: expects a file that can be written: {error.strerror}")
 
 
 def refuse_file(flag: str, path: Path, overwrite: bool) -> None:
     """Raises `UsageError` where a file could not be written later, or would replace one that it may not."""
     try:
         if path.is_dir():
-            raise UsageError(f"{flag}={path}: takes a file, which this folder is not")
+            raise UsageError(f"{flag}={path}: expects a file, which this folder is not")
         if os.path.lexists(path) and not overwrite:
-            raise UsageError(f"{flag}={path}: is there already; takes another file, or --overwrite replaces it")
+            raise UsageError(f"{flag}={path}: is there already; expects another file, or --overwrite replaces it")
         if not _can_be_written(path.parent):
-            raise UsageError(f"{flag}={path}: takes a file in a folder that can be written")
+            raise UsageError(f"{flag}={path}: expects a file in a folder that can be written")
     except OSError as error:  # a name that is too long
-        raise UsageError(f"{flag}={path}: takes a file that can be written: {error.strerror}") from None
+        raise UsageError(f"{flag}={path}: expects a file that can be written: {error.strerror}") from None
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
@@ -181,7 +183,7 @@ def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
             with files.whole_file(out / name) as file:
                 file.write(content)
     except OSError as error:
-        raise UsageError(f"--out={out}: takes a folder that can be written: {error.strerror}") from None
+        raise UsageError(f"--out={out}: expects a folder that can be written: {error.strerror}") from None
 
 
 def printable(text: str, kept: str = "") -> str:

@@ -24,7 +24,7 @@ class _Loader(yaml.SafeLoader):
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
         for key, count in keys.items():
             if count > 1:
-                raise Refused(f"takes each setting once, not {key[:50]} {count} times")
+                raise Refused(f"expects each setting once, not {key[:50]} {count} times")
         return super().construct_mapping(node, deep)
 
 
@@ -36,11 +36,11 @@ def arguments(path: Path) -> list[str]:
     """
     try:
         if not path.is_file():
-            raise Refused("takes a file, which this is not" if path.exists() else "there is no such file")
+            raise Refused("expects a file, which this is not" if path.exists() else "there is no such file")
         with path.open("rb") as file:
             text = file.read(MAX_BYTES + 1)
         if len(text) > MAX_BYTES:
-            raise Refused(f"takes a file of at most {MAX_BYTES} bytes")
+            raise Refused(f"expects a file of at most {MAX_BYTES} bytes")
         content = yaml.load(text.decode("utf-8"), _Loader)
     except Refused:
         raise
@@ -48,9 +48,9 @@ def arguments(path: Path) -> list[str]:
         raise Refused(f"cannot be read: {error.strerror}") from None
     # Beside its own errors, PyYAML lets pass what Python says of a date, a number or a tag that cannot be.
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError):
-        raise Refused("takes a YAML file, which this is not") from None
+        raise Refused("expects a YAML file, which this is not") from None
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise Refused("takes lines like `steps: 100000`")
+        raise Refused("expects lines like `steps: 100000`")
     return [_argument(key, value) for key, value in content.items()]
 
 
@@ -59,5 +59,5 @@ def _argument(key: str, value: Any) -> str:
         raise Refused(f"{key} is for the command line")
     items = value if isinstance(value, list) else [value]
     if not items or not all(isinstance(item, bool | int | float | str) for item in items):
-        raise Refused(f"{key} takes a number, a word or a list of them")
+        raise Refused(f"{key} expects a number, a word or a list of them")
     return f"--{key}={','.join(str(item).lower() if isinstance(item, bool) else str(item) for item in items)}"

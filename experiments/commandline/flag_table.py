@@ -73,7 +73,7 @@ DEFAULT_TEXT = {
 class Flag(NamedTuple):
     name: str
     parse: Callable[[str], Any] | None  # None: a switch
-    takes: str
+    expects: str
     help: str
     default: str
 
@@ -111,20 +111,20 @@ def _setting_flag(field: dataclasses.Field) -> Flag:
     default = str(field.default)
     parse: Callable[[str], Any] | None
     if field.name == "temperature":
-        parse, takes = _numbers_or_auto, "a number, a list like 0.1,0.2, or auto"
+        parse, expects = _numbers_or_auto, "a number, a list like 0.1,0.2, or auto"
     elif field.name in Scalars._fields:
-        parse, takes = _list_of(_number), "a number, or a list like 0.1,0.5"
+        parse, expects = _list_of(_number), "a number, or a list like 0.1,0.5"
     elif isinstance(field.default, bool):
-        parse, takes, default = None, "true or false", default.lower()
+        parse, expects, default = None, "true or false", default.lower()
     elif isinstance(field.default, int):
-        parse, takes = _integer, "a whole number"
+        parse, expects = _integer, "a whole number"
     elif isinstance(field.default, float):
-        parse, takes = _number, "a number"
+        parse, expects = _number, "a number"
     elif isinstance(field.default, tuple):
-        parse, takes, default = _list_of(_integer), "whole numbers like 256,256", ",".join(map(str, field.default))
+        parse, expects, default = _list_of(_integer), "whole numbers like 256,256", ",".join(map(str, field.default))
     else:
-        parse, takes = str, "a word"
-    return Flag(field.name, parse, takes, SETTING_HELP.get(field.name, ""), DEFAULT_TEXT.get(field.name, default))
+        parse, expects = str, "a word"
+    return Flag(field.name, parse, expects, SETTING_HELP.get(field.name, ""), DEFAULT_TEXT.get(field.name, default))
 
 
 def _settings(config: type) -> list[Flag]:
@@ -228,6 +228,6 @@ def help_text() -> str:
 def _metavar(flag: Flag) -> str:
     if flag.name == "temperature":
         return "X[,X...]|auto"
-    if flag.takes.startswith("a number, "):
+    if flag.expects.startswith("a number, "):
         return "X[,X...]"
-    return {"a number": "X", "a whole number": "N"}.get(flag.takes, "N,N..." if "numbers" in flag.takes else "NAME")
+    return {"a number": "X", "a whole number": "N"}.get(flag.expects, "N,N..." if "numbers" in flag.expects else "NAME")

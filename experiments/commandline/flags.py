@@ -26,7 +26,7 @@ MAX_SEED = 2**32 - 1
 MAX_MEMBERS = 10_000
 # What absl understands beside the flags that are defined: another file of flags, and flags that may be unknown.
 ABSL_FLAGS = ("flagfile", "undefok")
-# The run's own flags that a resumed run takes over; the smallest value of each.
+# The run's own flags that a resumed run expects over; the smallest value of each.
 OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "devices": 1, "tensorboard": False}
 LATEST = "\n"  # no folder's name on a command line
 
@@ -54,14 +54,14 @@ class Options(NamedTuple):
 class _Parser(absl_flags.ArgumentParser):
     def __init__(self, flag: Flag):
         self.flag = flag
-        self.syntactic_help = flag.takes
+        self.syntactic_help = flag.expects
 
     def parse(self, argument: str) -> Any:
         assert self.flag.parse is not None
         try:
             return self.flag.parse(argument)
         except (ValueError, OverflowError):
-            raise ValueError(f"takes {self.flag.takes}") from None
+            raise ValueError(f"expects {self.flag.expects}") from None
 
 
 def _values(argv: Sequence[str]) -> dict[str, Any]:
@@ -86,11 +86,11 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
     except (absl_flags.Error, ValueError) as error:
         text = str(error).removeprefix("flag ").removeprefix("ERROR:: ")
-        text = re.sub(r"\('Non-boolean argument to boolean flag', .*\)", "takes true or false", text)
+        text = re.sub(r"\('Non-boolean argument to boolean flag', .*\)", "expects true or false", text)
         missing = re.fullmatch(r"Missing value for flag -*(\w+)", text)
         if missing:
-            takes = next(flag.takes for flag in known if flag.name == missing[1])
-            text = f"--{missing[1]}: takes {takes}"
+            expects = next(flag.expects for flag in known if flag.name == missing[1])
+            text = f"--{missing[1]}: expects {expects}"
         raise UsageError(text) from None
     if rest:
         raise UsageError(f"{rest[0]}: unexpected argument; settings are given as --flag=value")
@@ -133,23 +133,25 @@ def parse(argv: Sequence[str]) -> Options | None:
     output = {name: values.pop(name, None) for name in OUTPUT}
     resume, overwrite = values.pop("resume", None), values.pop("overwrite", False)
     if resume == "":
-        raise UsageError("--resume=: takes the folder of a run, or nothing at all: --resume")
+        raise UsageError("--resume=: expects the folder of a run, or nothing at all: --resume")
     folder_given = resume not in (None, LATEST)
     for required in ("algo", "env"):
         if not own[required] and resume in (None, LATEST):
             raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
     if resume is not None and overwrite:
-        raise UsageError("--overwrite: takes no --resume beside it: the one replaces a run, the other goes on with it")
+        raise UsageError(
+            "--overwrite: expects no --resume beside it: the one replaces a run, the other goes on with it"
+        )
     for name in ("out", "name", "preset"):
         if folder_given and own[name] is not None:
             raise UsageError(f"--{name}: has no effect with --resume={resume}")
     for name, lowest in OUTPUT.items():
         if output[name] is not None and output[name] < lowest:
-            raise UsageError(f"--{name}: takes a whole number of at least {lowest}, not {output[name]}")
+            raise UsageError(f"--{name}: expects a whole number of at least {lowest}, not {output[name]}")
 
     preset = own["preset"] or "paper"
     if preset not in PRESETS:
-        raise UsageError(f"--preset={preset}: takes one of {', '.join(PRESETS)}")
+        raise UsageError(f"--preset={preset}: expects one of {', '.join(PRESETS)}")
 
     name = own["name"]
     if name is not None and (
@@ -160,11 +162,11 @@ def parse(argv: Sequence[str]) -> Options | None:
         or len(name.encode()) > 200
     ):
         raise UsageError(
-            f"--name={name[:40]}: takes up to 200 bytes, no slashes or control characters: it names a folder"
+            f"--name={name[:40]}: expects up to 200 bytes, no slashes or control characters: it names a folder"
         )
     for flag, folder in (("out", own["out"]), ("resume", resume if folder_given else None)):
         if folder is not None and not (folder and _is_path(folder)):
-            raise UsageError(f"--{flag}={folder[:40]}: takes a folder")
+            raise UsageError(f"--{flag}={folder[:40]}: expects a folder")
 
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
@@ -187,7 +189,7 @@ def parse(argv: Sequence[str]) -> Options | None:
     sweep = {scalar: sweep[scalar] for scalar in Scalars._fields if scalar in sweep}
     count = math.prod(map(len, sweep.values())) * len(own["seeds"] or DEFAULT_SEEDS)
     if count > MAX_MEMBERS:
-        raise UsageError(f"--seeds: takes at most {MAX_MEMBERS} members, seeds times swept values, not {count}")
+        raise UsageError(f"--seeds: expects at most {MAX_MEMBERS} members, seeds times swept values, not {count}")
     return Options(
         algo=own["algo"],
         env=own["env"],
@@ -207,7 +209,7 @@ def parse(argv: Sequence[str]) -> Options | None:
 def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
-            raise UsageError(f"--seeds={seed}: takes whole numbers from 0 to {MAX_SEED}")
+            raise UsageError(f"--seeds={seed}: expects whole numbers from 0 to {MAX_SEED}")
     _refuse_duplicates("seeds", seeds)
     return seeds
 
@@ -223,4 +225,4 @@ def _is_path(text: str) -> bool:
 def _refuse_duplicates(name: str, values: Sequence[Any]) -> None:
     for value in values if len(set(values)) < len(values) else ():
         if values.count(value) > 1:
-            raise UsageError(f"--{name}: takes each value once, {value} is there {values.count(value)} times")
+            raise UsageError(f"--{name}: expects each value once, {value} is there {values.count(value)} times")

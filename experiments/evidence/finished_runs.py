@@ -33,7 +33,7 @@ def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
         try:
             if not path.is_dir():
                 what = "is no folder" if path.exists() else "there is no such folder"
-                raise UsageError(f"{text}: {what}; RUNS takes folders of runs or folders above them")
+                raise UsageError(f"{text}: {what}; RUNS expects folders of runs or folders above them")
             below, without = _below(path)
         except (OSError, ValueError) as error:
             if isinstance(error, UsageError):

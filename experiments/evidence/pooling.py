@@ -208,7 +208,7 @@ def collect(paths: Sequence[str]) -> Collected:
             notes.append(f"left out: {path} has no evaluation yet")
         curves += found
     if not curves:
-        raise UsageError("; ".join(notes) or "RUNS: takes folders with runs")
+        raise UsageError("; ".join(notes) or "RUNS: expects folders with runs")
     return arrange(pool(curves), notes)
 
 
@@ -221,7 +221,7 @@ def pool(curves: Iterable[Curves]) -> list[Group]:
             algo, env = member.settings["algo"], member.settings["env"]
             raise UsageError(
                 f"{seeds[member.seed].run} and {member.run}: both hold seed {member.seed} of {algo} on {env} with the "
-                "same settings; takes one of them"
+                "same settings; expects one of them"
             )
         seeds[member.seed] = member
     groups = [Group(tuple(seeds[seed] for seed in sorted(seeds))) for seeds in pools.values()]

@@ -163,7 +163,7 @@ def _commands(content: Mapping[str, Any]) -> list[Command]:
 
 
 def _command(entry: Mapping[str, Any], label: str) -> Command:
-    """A command line as a shell takes it. Its first word was the path of `experiments/run.py`."""
+    """A command line as a shell expects it. Its first word was the path of `experiments/run.py`."""
     words = entry.get("command")
     if not isinstance(words, list) or len(words) < 2 or not all(isinstance(word, str) for word in words):
         return Command(None, label, "No command that could be repeated is recorded in config.json.")

@@ -34,7 +34,7 @@ def page(env: Any, shown: Sequence[Any]) -> bytes:
         for episode in shown
         for t in range(len(episode.pos))
     ]
-    # The viewer takes one state for each of the simulator's steps, of which a control step has several.
+    # The viewer expects one state for each of the simulator's steps, of which a control step has several.
     system = env.sys.tree_replace({"opt.timestep": float(env.dt)})
     # the whole window: a height that is a number has no unit there, and counts for nothing
     return html.render(system, states, height="100vh", colab=False).encode()

@@ -27,7 +27,7 @@ def format_of(path: Path) -> str:
     """The format that a file's name asks for. Raises `ValueError` where it is none of `FORMATS`."""
     suffix = path.suffix.lower().removeprefix(".")
     if suffix not in FORMATS or not path.stem:
-        raise ValueError(f"takes a file with the ending {', '.join(f'.{name}' for name in FORMATS)}")
+        raise ValueError(f"expects a file with the ending {', '.join(f'.{name}' for name in FORMATS)}")
     return suffix
 
 
@@ -58,7 +58,7 @@ def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str 
         raise ValueError("a film needs a picture")
     height, width, _ = first.shape
     if height % 2 or width % 2:
-        raise ValueError(f"a film takes even numbers of pixels, not {width}x{height}")
+        raise ValueError(f"a film expects even numbers of pixels, not {width}x{height}")
     pictures = chain([first], pictures)
     if name == "gif":
         return _gif(pictures, period)

@@ -26,7 +26,7 @@ def read(path: Path) -> Described:
     try:
         return run_config.read(path)
     except run_config.NotDescribed as error:
-        raise UsageError(f"{path}: takes the folder of a run; {error}") from None
+        raise UsageError(f"{path}: expects the folder of a run; {error}") from None
 
 
 def final_returns(path: Path, count: int) -> list[float]:
@@ -53,16 +53,16 @@ def choose(run: Described, returns: Sequence[float], seed: int | None = None, nu
     members = run.members
     if number is not None:
         if number >= len(members):
-            raise UsageError(f"--member={number}: takes one of the run's members, 0 to {len(members) - 1}")
+            raise UsageError(f"--member={number}: expects one of the run's members, 0 to {len(members) - 1}")
         if seed not in (None, members[number].seed):
             raise UsageError(
-                f"--seed={seed}: member {number} has seed {members[number].seed}; takes --seed or --member"
+                f"--seed={seed}: member {number} has seed {members[number].seed}; expects --seed or --member"
             )
         return Chosen(number, members[number], f"of {len(members)}")
     found = [i for i, member in enumerate(members) if seed in (None, member.seed)]
     if not found:
         seeds = ", ".join(str(value) for value in dict.fromkeys(member.seed for member in members))
-        raise UsageError(f"--seed={seed}: takes a seed of the run, one of {_short(seeds)}")
+        raise UsageError(f"--seed={seed}: expects a seed of the run, one of {_short(seeds)}")
     known = [i for i in found if not math.isnan(returns[i])]
     best = max(known, key=lambda i: returns[i]) if known else found[0]
     of = f"of {len(found)}" + ("" if seed is None else " with this seed")
@@ -90,7 +90,7 @@ def load(path: Path, chosen: Chosen, env: Environment) -> Callable[[Array], Arra
     """
     folder = path / "policy"
     if not folder.is_dir():
-        raise UsageError(f"{path}: takes a run with a policy, which is saved when training ends; it has none yet")
+        raise UsageError(f"{path}: expects a run with a policy, which is saved when training ends; it has none yet")
     try:
         policy = load_policy(folder, chosen.number)
         sizes = _sizes(folder)

@@ -12,7 +12,7 @@ import numpy as np
 TRACKING = "track"  # the camera that follows the robot, in the models of Gymnasium's locomotion tasks
 
 DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees, of a camera of our own: from where Gymnasium's look
-SHADOW_TEXELS = 1024  # as fine as the pictures are; MuJoCo's 4096 double the time that software takes to draw one
+SHADOW_TEXELS = 1024  # as fine as the pictures are; MuJoCo's 4096 double the time that software expects to draw one
 
 
 def cameras(model: mujoco.MjModel) -> list[str]:
@@ -51,7 +51,7 @@ def view_of(model: mujoco.MjModel, camera: str = "") -> mujoco.MjvCamera:
     names = cameras(model)
     view = mujoco.MjvCamera()
     if camera and camera not in names:
-        raise ValueError(f"takes one of {', '.join(names) or 'no names: the model has no cameras'}, not {camera!r}")
+        raise ValueError(f"expects one of {', '.join(names) or 'no names: the model has no cameras'}, not {camera!r}")
     if camera or TRACKING in names:
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         view.fixedcamid = model.camera(camera or TRACKING).id

@@ -43,7 +43,7 @@ class Checkpoints:
       replay: the run's replay, which says where its state keeps its rows.
       layout: the run's members and where they lie: on disk are theirs alone, whatever the devices.
       keep: how many checkpoints are kept, the latest ones.
-      warn: takes a line on what went wrong; a checkpoint that cannot be written is no reason to stop training.
+      warn: expects a line on what went wrong; a checkpoint that cannot be written is no reason to stop training.
     """
 
     def __init__(self, path: Path, replay: Replay, layout: Layout, keep: int, warn: Callable[[str], None]):

@@ -1,6 +1,6 @@
 """The host loop: chunks of compiled training between evaluations and checkpoints, and what they report.
 
-Everything the loop needs is a value: the compiled sweep, a display, a function that takes reports, one that takes
+Everything the loop needs is a value: the compiled sweep, a display, a function that expects reports, one that expects
 checkpoints, one that says whether to stop. It writes no files.
 """
 

@@ -31,7 +31,7 @@ class Plan(NamedTuple):
     output: dict[str, Any]  # the values of `flags.OUTPUT`
     layout: Layout
     env: Environment
-    own_env: Environment | None  # which takes the place of the named one
+    own_env: Environment | None  # which expects the place of the named one
     options: flags.Options
 
     @property
@@ -45,7 +45,7 @@ class Plan(NamedTuple):
 
 
 def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
-    """What a command line asks for; `env` takes the place of the environment that it names.
+    """What a command line asks for; `env` expects the place of the environment that it names.
 
     Raises `UsageError` for settings that cannot be, a directory that is taken and too little memory.
     """
@@ -59,7 +59,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         except records.NotARun:
             raise UsageError(not_a_run(path)) from None
         except OSError as error:
-            raise UsageError(f"--out={options.out}: takes a folder that can be read: {error}") from None
+            raise UsageError(f"--out={options.out}: expects a folder that can be read: {error}") from None
     config = members[0].config
     own_env = env
     try:
@@ -72,7 +72,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     if needed > free:
         raise UsageError(
             f"--replay_capacity={config.train.replay_capacity}: {len(members)} members need about "
-            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; takes a smaller number, or fewer --seeds"
+            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; expects a smaller number, or fewer --seeds"
         )
     return Plan(members, swept, path, run, output, layout, env, own_env, options)
 
@@ -137,7 +137,7 @@ def _output(options: flags.Options, run: Described | None, train: TrainConfig) -
         output["checkpoint_every"] -= output["checkpoint_every"] % train.num_envs
     elif options.checkpoint_every % train.num_envs:
         raise UsageError(
-            f"--checkpoint_every: takes a multiple of num_envs ({train.num_envs}), not {options.checkpoint_every}"
+            f"--checkpoint_every: expects a multiple of num_envs ({train.num_envs}), not {options.checkpoint_every}"
         )
     return output
 
@@ -148,9 +148,9 @@ def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
     count = devices or usable_devices(num_members)
     if count > len(here):
         whose = "" if typed else ", and the run was started with more"
-        raise UsageError(f"--devices={count}: takes at most {len(here)} here{whose}")
+        raise UsageError(f"--devices={count}: expects at most {len(here)} here{whose}")
     if count > num_members:
-        raise UsageError(f"--devices={count}: takes at most one for each of {num_members} members")
+        raise UsageError(f"--devices={count}: expects at most one for each of {num_members} members")
     return Layout(num_members, tuple(here[:count]))
 
 
@@ -174,11 +174,11 @@ def _may_be(name: str, value: Any) -> bool:
 
 
 def not_a_run(path: Path) -> str:
-    return f"--overwrite: {path} holds other things than a run; takes a folder with a run alone"
+    return f"--overwrite: {path} holds other things than a run; expects a folder with a run alone"
 
 
 def taken(path: Path) -> str:
-    return f"--name={path.name}: {path} already holds a run; takes another name, or --overwrite replaces it"
+    return f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
 
 
 def _free_memory(devices: int) -> int:

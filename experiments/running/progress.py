@@ -137,7 +137,7 @@ class Display:
 def counting(
     what: str, total: int, console: Console, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[int], None]]:
-    """Shows how much of `total` is done and how long the rest takes; gives the function that is told what is done.
+    """Shows how much of `total` is done and how long the rest expects; gives the function that is told what is done.
 
     On a terminal a live line that goes when all is done, elsewhere a line every `PLAIN_SECONDS`.
     """

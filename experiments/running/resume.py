@@ -29,10 +29,10 @@ def named(path: Path, wanted: Mapping[str, Any], devices: int | None = None) -> 
         run = run_config.read(path)
         link = records.link_in(path)
     except run_config.NotDescribed as error:
-        raise UsageError(f"--resume={path}: takes the folder of a run; {error}") from None
+        raise UsageError(f"--resume={path}: expects the folder of a run; {error}") from None
     except OSError as error:
-        raise UsageError(f"--resume={path}: takes a folder that can be read: {error.strerror}") from None
-    refusal = f"takes a folder that holds the run itself; {link} in it is a link" if link else _refusal(run, wanted)
+        raise UsageError(f"--resume={path}: expects a folder that can be read: {error.strerror}") from None
+    refusal = f"expects a folder that holds the run itself; {link} in it is a link" if link else _refusal(run, wanted)
     if refusal:
         raise UsageError(f"--resume={path}: {refusal}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
@@ -56,7 +56,7 @@ def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:
     try:
         paths = sorted(folder.iterdir()) if folder.is_dir() else []
     except OSError as error:
-        raise UsageError(f"--resume: takes a folder that can be read as --out: {error}") from None
+        raise UsageError(f"--resume: expects a folder that can be read as --out: {error}") from None
     for path in paths:
         try:
             run = named(path, wanted)
@@ -64,7 +64,7 @@ def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:
             continue
         found.append((str(run.content.get("started")), path, run))
     if not found:
-        raise UsageError(f"--resume: there is no run of these settings in {folder}; takes its folder: --resume=DIR")
+        raise UsageError(f"--resume: there is no run of these settings in {folder}; expects its folder: --resume=DIR")
     _, path, run = max(found, key=lambda item: item[:2])
     return path, run
 
@@ -88,12 +88,12 @@ def _refusal(run: Described, wanted: Mapping[str, Any]) -> str | None:
         if name not in NOT_COMPARED and its.get(name) != value
     ]
     if differing:
-        return f"takes the run's own settings; these differ: {', '.join(differing)}"
+        return f"expects the run's own settings; these differ: {', '.join(differing)}"
     if wanted.get("steps", its["steps"]) < its["steps"]:
-        return f"takes at least the run's own --steps ({its['steps']:,}), not {wanted['steps']:,}"
+        return f"expects at least the run's own --steps ({its['steps']:,}), not {wanted['steps']:,}"
     there, here = str(run.content["versions"].get("sqt_jax")), str(run_config.versions()["sqt_jax"])
     if there.split(".")[:2] != here.split(".")[:2]:
-        return f"takes a run of sqt_jax {'.'.join(here.split('.')[:2])}, not {there[:20]}"
+        return f"expects a run of sqt_jax {'.'.join(here.split('.')[:2])}, not {there[:20]}"
     return None
 
 

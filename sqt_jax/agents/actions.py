@@ -1,4 +1,4 @@
-"""What an algorithm's way of acting consists of. TD3's is in `td3`, SAC's in `sac`; TD7 takes TD3's."""
+"""What an algorithm's way of acting consists of. TD3's is in `td3`, SAC's in `sac`; TD7 uses TD3's."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -43,7 +43,7 @@ def assess(
 
     Args:
       learner: what the next snapshot is.
-      gradient_steps: []; past `checkpoint_switch`, an assessment takes `assessment_episodes` instead of one.
+      gradient_steps: []; past `checkpoint_switch`, an assessment expects `assessment_episodes` instead of one.
       episode_return: [], of the episode if it `ended` [] bool; else nothing changes.
     """
     late = gradient_steps >= config.checkpoint_switch

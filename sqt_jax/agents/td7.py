@@ -129,7 +129,7 @@ def make_sale_agent(
         if not state.checkpoints:
             return state
         if episode_return.shape != (1,) or ended.shape != (1,):
-            raise ValueError(f"td7 takes one environment: returns and ends of [1], not {episode_return.shape}")
+            raise ValueError(f"td7 expects one environment: returns and ends of [1], not {episode_return.shape}")
         checkpoints = assessment.assess(
             config,
             state.checkpoints,

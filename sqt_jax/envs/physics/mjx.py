@@ -31,9 +31,9 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
     """MJX with Newton's method (it has no PGS, which the humanoid's file asks for).
 
     Args:
-      iterations: most steps of the constraint solver; None takes the model file's. A control step with 8 is as near to
+      iterations: most steps of the constraint solver; None: the model file's. A control step with 8 is as near to
         MuJoCo's as one with 100; some tasks need fewer (`Task.options`).
-      ls_iterations: most steps of its line search, which under `vmap` all cost time; None takes the model file's.
+      ls_iterations: most steps of its line search, which under `vmap` all cost time; None: the model file's.
 
     Raises:
       ValueError: the model has activation states, or an integrator other than Euler and RK4.
@@ -122,7 +122,7 @@ def newton_model(model: mujoco.MjModel, iterations: int | None, ls_iterations: i
     """
     for name, limit in {"iterations": iterations, "ls_iterations": ls_iterations}.items():
         if limit is not None and limit < 1:
-            raise ValueError(f"{name}: takes a whole number of at least 1, or None for the model file's, not {limit}")
+            raise ValueError(f"{name}: expects a whole number of at least 1, or None for the model file's, not {limit}")
     model = copy.copy(model)
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if model.na or integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):

@@ -24,8 +24,8 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
     """MJX-Warp with Newton's method, started from MJX's kinematics.
 
     Args:
-      iterations: most steps of the constraint solver, which stops where it has converged; None takes the model file's.
-      ls_iterations: most steps of its line search; None takes the model file's.
+      iterations: most steps of the constraint solver, which stops where it has converged; None: the model file's.
+      ls_iterations: most steps of its line search; None: the model file's.
 
     Raises:
       ValueError: the model has activation states, or an integrator other than Euler and RK4.

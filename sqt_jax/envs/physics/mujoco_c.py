@@ -45,7 +45,7 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
     if model.na:
         raise ValueError(f"{model.na} activation states: only models with none")
     if num_threads is not None and num_threads < 1:
-        raise ValueError(f"num_threads takes at least 1, not {num_threads}")
+        raise ValueError(f"num_threads expects at least 1, not {num_threads}")
     placed_quantities = _placed_quantities(setup)
     stepper = Stepper(setup, num_threads or usable_cores())
     num_places = model.nq + model.nv
