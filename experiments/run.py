@@ -231,7 +231,7 @@ def _announce(console: Console, plan: "Plan", restored: "Restored | None", sizes
         if others := resume.other_versions(plan.resumed):
             say(f"other versions than when it began, so that it may go on differently: {', '.join(others)}")
     # The policy whose values are judged is played beside the deterministic one, where it is another.
-    episodes = train.eval_episodes * (2 if agent_of(plan.config, plan.env).valued_act else 1)
+    episodes = train.eval_episodes * (2 if agent_of(plan.config, plan.env).views.sample else 1)
     evaluations = len(evaluation_steps(train))
     say(progress.evaluation_share(train.steps, evaluations, episodes, plan.env.episode_length))
     if every := plan.output["checkpoint_every"]:

@@ -1,9 +1,9 @@
 """Prioritised replay for TD7: LAP (https://arxiv.org/abs/2007.06049).
 
-A row is drawn with probability proportional to its priority. The priorities lie in blocks of 128, with the sums of
-blocks and the sums of blocks of blocks beside them: a draw reads one block of each level, a new priority rewrites one
-sum of each level, so that neither depends on the capacity. Sums are computed anew from their block, never adjusted:
-rounding errors cannot accumulate.
+A row is drawn with probability proportional to its priority. Priorities are stored in blocks of 128, with a level of
+sums of blocks, a level of sums of those, and so on. A draw reads one block of each level, a new priority rewrites one
+sum of each level; neither depends on the capacity. A sum is always computed from its block, never adjusted: rounding
+errors cannot accumulate.
 """
 
 import math
@@ -21,7 +21,7 @@ BLOCK = 128
 class LapState(NamedTuple):
     rows: RingState
     levels: tuple[Array, ...]  # [blocks, BLOCK] each: priorities, sums of their blocks, ...; the last has one block
-    max_priority: Array  # []: what new rows get
+    max_priority: Array  # []: the priority of new rows
 
 
 def _shapes(capacity: int) -> list[tuple[int, int]]:
@@ -34,14 +34,14 @@ def _shapes(capacity: int) -> list[tuple[int, int]]:
 def priority(td_error: Array, exponent: float, min_priority: float) -> Array:
     """LAP's priority of rows whose largest |TD error| over the critics is `td_error` [B]: [B]
 
-    What is not finite counts as no error: it would spoil every sum above it.
+    An error that is not finite counts as 0: it would spoil every sum above it.
     """
     size = jnp.where(jnp.isfinite(td_error), jnp.abs(td_error), 0.0)
     return jnp.maximum(size, min_priority) ** exponent
 
 
 def set_priorities(levels: tuple[Array, ...], index: Array, value: Array) -> tuple[Array, ...]:
-    """The priorities `value [B]` for the rows `index [B]`, and the sums above them."""
+    """Sets the priorities of the rows `index [B]` to `value [B]`, and updates the sums above them."""
     changed = []
     for level in levels:
         block, place = index // BLOCK, index % BLOCK
@@ -54,8 +54,8 @@ def set_priorities(levels: tuple[Array, ...], index: Array, value: Array) -> tup
 def draw(key: Array, weights: Array) -> Array:
     """For each row of `weights [B, K]` an index with probability proportional to its weight: [B].
 
-    Never one of weight 0, whatever the order in which the cumulative sum is rounded: such rows do not count, and the
-    threshold is below the highest of the others.
+    Never one of weight 0, however the cumulative sum is rounded: such entries do not count, and the threshold is below
+    the highest of the others.
     """
     reached = jnp.where(weights > 0, jnp.cumsum(weights, axis=-1), 0.0)
     threshold = jnp.max(reached, axis=-1, keepdims=True) * jax.random.uniform(key, (weights.shape[0], 1))
@@ -80,12 +80,12 @@ def lap(
     """A buffer that samples in proportion to max(|td_error|, min_priority)^priority_exponent.
 
     New rows get the largest priority seen; every `refresh_every` updates that becomes the largest in the buffer.
-    Transitions that have lost their final observation (`Ring`) are drawn no more, older ones are.
+    Transitions that have lost their final observation (`Ring`) are not drawn any more.
 
     Args:
       ring: the sizes of the store.
       batch_size: B.
-      refresh_every: in the `gradient_steps` that `feedback` is given (TD7's: with each copy of its targets).
+      refresh_every: updates between refreshes of the largest priority (TD7: with each copy of its targets).
     """
 
     def init() -> LapState:
@@ -95,7 +95,7 @@ def lap(
     def insert(state: LapState, transition: Transition) -> LapState:
         rows, lost = ring.insert(state.rows, transition)
         new = state.rows.inserted % ring.capacity + jnp.arange(ring.num_envs)
-        # A transition without its final observation is drawn no more; where there is none, a new row is set twice.
+        # A transition without its final observation gets priority 0. If there is none, a new row is set twice.
         gone = lost >= jnp.maximum(rows.inserted - ring.capacity, 0)
         index = jnp.concatenate([new, jnp.where(gone, lost % ring.capacity, new)])
         value = jnp.where(jnp.concatenate([jnp.zeros_like(gone), gone]), 0.0, state.max_priority)
@@ -105,13 +105,13 @@ def lap(
         index = draw_rows(key, state.levels, batch_size)
         return ring.read(state.rows, index), index
 
-    def feedback(state: LapState, index: Array, td_error: Array, gradient_steps: Array) -> LapState:
+    def feedback(state: LapState, index: Array, td_error: Array, step: Array) -> LapState:
         new = priority(td_error, priority_exponent, min_priority)
         highest = jnp.maximum(state.max_priority, jnp.max(new))
         there = state.levels[0][index // BLOCK, index % BLOCK] > 0  # not lost since it was drawn
         levels = set_priorities(state.levels, index, jnp.where(there, new, 0.0))
-        # A scalar that members share: a real branch under vmap, taken rarely, since it reads every priority.
-        refresh = gradient_steps % refresh_every == 0
+        # Members share the condition: a real branch under vmap. It reads every priority, so it must stay rare.
+        refresh = step % refresh_every == 0
         highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
         return LapState(state.rows, levels, highest)
 
@@ -127,4 +127,15 @@ def lap(
     def size(state: LapState) -> Array:
         return ring.size(state.rows)
 
-    return Replay(ring.capacity, init, insert, sample, feedback, size, rows, with_rows, without_rows)
+    return Replay(
+        capacity=ring.capacity,
+        init=init,
+        insert=insert,
+        sample=sample,
+        feedback=feedback,
+        size=size,
+        rows=rows,
+        with_rows=with_rows,
+        without_rows=without_rows,
+        member_axes=LapState(rows=ring.member_axes(), levels=0, max_priority=0),  # type: ignore[arg-type]
+    )

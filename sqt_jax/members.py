@@ -1,8 +1,8 @@
-"""The members of a sweep: which leaves of a state each has its own of, and how they lie along devices.
+"""The members of a sweep along devices.
 
-Members never exchange anything. On several devices each one runs the same compiled program over its share of them
-(`jax.shard_map` over a mesh of one axis), with its own loops and branches; shares are equal, so that a sweep whose
-size is no multiple of the number of devices holds copies of its first members at its end, which nobody asks for.
+Members never exchange anything. Each device runs the same compiled program on its share of them (`jax.shard_map` over a
+mesh of one axis), with its own loops and branches. Shares are equal: a sweep whose size is not a multiple of the number
+of devices is padded with copies of its first members, which are ignored.
 """
 
 import math
@@ -16,29 +16,26 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from sqt_jax.types import State
 
 AXIS = "members"
-# Leaves that are equal in all members, which advance in lockstep.
-SHARED_LEAVES = frozenset({"env_steps", "gradient_steps", "inserted"})
 
 
-def member_axes(state: State) -> Any:
-    """For each leaf of a state: 0 where members have their own, None where they share it."""
+def every_leaf(axes: Any, state: State) -> Any:
+    """A prefix tree of `vmap` axes (0: each member has its own, None: members share it), spread over all leaves."""
+    return jax.tree.map(lambda axis, part: jax.tree.map(lambda _: axis, part), axes, state, is_leaf=_is_axis)
 
-    def axis(path, _):
-        name = getattr(path[-1], "name", None)
-        return None if name in SHARED_LEAVES else 0
 
-    return jax.tree_util.tree_map_with_path(axis, state)
+def _is_axis(axis: Any) -> bool:
+    return axis is None or axis == 0
 
 
 class Layout(NamedTuple):
     """S members along some devices.
 
-    The devices may be those of several hosts (`jax.distributed`): then every process calls the sweep's functions with
-    the same arguments, and sees those members that lie on its own devices.
+    The devices may belong to several hosts (`jax.distributed`): then every process calls the sweep's functions with
+    the same arguments and sees the members on its own devices.
     """
 
     members: int
-    devices: tuple[jax.Device, ...] = ()  # none: the default one
+    devices: tuple[jax.Device, ...] = ()  # empty: the default device
 
     @property
     def spread(self) -> bool:
@@ -46,7 +43,7 @@ class Layout(NamedTuple):
 
     @property
     def held(self) -> int:
-        """S and the copies that fill the last device's share."""
+        """S and the padding of the last device's share."""
         return len(self.devices) * math.ceil(self.members / len(self.devices)) if self.spread else self.members
 
     @property
@@ -54,12 +51,12 @@ class Layout(NamedTuple):
         return Mesh(np.asarray(self.devices), (AXIS,))
 
     def specs(self, axes: Any) -> Any:
-        """Of a tree of `vmap`'s axes."""
+        """The partition of a tree of `vmap` axes."""
         spec = {None: PartitionSpec(), 0: PartitionSpec(AXIS)}
         return jax.tree.map(spec.__getitem__, axes, is_leaf=lambda axis: axis is None)
 
     def sharding(self, axis: int | None) -> NamedSharding | None:
-        """Of a leaf with this axis of members; None is the default device."""
+        """The sharding of a leaf with this axis of members; None is the default device."""
         return NamedSharding(self.mesh, self.specs(axis)) if self.spread else None
 
     def over_members(self, function: Callable, in_axes: tuple, out_axes: Any) -> Callable:
@@ -68,7 +65,7 @@ class Layout(NamedTuple):
         if not self.spread:
             return mapped
         specs = {"in_specs": self.specs(in_axes), "out_specs": self.specs(out_axes)}
-        # Leaves that members share are computed alike on every device, which the check could not know.
+        # Every device computes the leaves that members share in the same way; the check cannot see that.
         return jax.shard_map(mapped, mesh=self.mesh, **specs, check_vma=False)
 
     def filled(self, leaf: Any) -> Any:
@@ -77,14 +74,11 @@ class Layout(NamedTuple):
 
 
 def usable_devices(members: int) -> int:
-    """How many of this process's devices a sweep is spread over by itself: as many as give each the smallest share.
-
-    With more, some would hold copies alone.
-    """
+    """How many devices of this process a sweep uses by default: the fewest that give each the smallest share."""
     here = len(jax.local_devices())
     return math.ceil(members / math.ceil(members / here))
 
 
 def layout_here(members: int) -> Layout:
-    """A sweep on the devices that it expects by itself."""
+    """A sweep on its default devices."""
     return Layout(members, tuple(jax.local_devices()[: usable_devices(members)]))

@@ -1,6 +1,6 @@
-"""How parameters move: Adam with a traced learning rate, and the soft step of target networks.
+"""How parameters move: Adam with a traced learning rate, and the soft update of target networks.
 
-Neither moves where the agent has diverged. The choice is made number by number, inside the step, and costs no copy.
+Neither moves once the agent has diverged. The choice is made number by number inside the step and costs no copy.
 """
 
 import jax
@@ -11,24 +11,20 @@ from sqt_jax import trees
 from sqt_jax.types import Array, Params
 
 _adam = optax.scale_by_adam()
-
-
-def adam_init(params: Params) -> optax.OptState:
-    """Adam's moments at the start, shaped as the parameters."""
-    return _adam.init(params)
+adam_init = _adam.init  # parameters -> moments
 
 
 def adam_step(
     params: Params, opt_state: optax.OptState, grads: Params, lr: Array | float, diverged: Array
 ) -> tuple[Params, optax.OptState]:
-    """One step of Adam, or none where `diverged` []. `lr` may be traced, so that a sweep over it compiles once."""
+    """One step of Adam, or none where `diverged` []. `lr` may be traced."""
     direction, moments = _adam.update(grads, opt_state)
     moved = optax.apply_updates(params, jax.tree.map(lambda d: -lr * d, direction))
     return trees.where(diverged, (params, opt_state), (moved, moments))
 
 
 def overflows(grads: Params) -> Array:
-    """[] bool: whether a gradient is not finite, or so large that Adam could not square it."""
+    """[] bool: whether a gradient is not finite, or too large for Adam to square it."""
     return ~jnp.isfinite(optax.tree.norm(grads, squared=True))
 
 

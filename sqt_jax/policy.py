@@ -18,7 +18,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from sqt_jax.algorithms import ALGORITHMS, agent_of, make_config
+from sqt_jax.algorithms import agent_of, make_config, make_parts
 from sqt_jax.config import Config
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Agent, Array, Environment, State
@@ -42,7 +42,7 @@ def save_policy(
     """
     directory = Path(directory)
     agent = agent_of(config, env)
-    arrays = by_path(jax.device_get(agent.policy(agent_state)))
+    arrays = by_path(jax.device_get(agent.views.policy(agent_state)))
     expected = {name: leaf.shape for name, leaf in by_path(_shapes(agent)).items()}
     if {name: array.shape[1:] for name, array in arrays.items()} != expected:
         raise ValueError(f"agent_state has to be {config.algo}'s with a leading axis of members, [S, ...]")
@@ -64,7 +64,7 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
     """
     directory = Path(directory)
     config, sizes = _read_config(directory / "config.json")
-    agent = ALGORITHMS[config.algo].make_agent(config.agent, *sizes)
+    agent = make_parts(config.algo, config.agent, *sizes).agent
     expected = _shapes(agent)
     arrays = _read_arrays(directory / f"member_{member}.npz", by_path(expected))
     if arrays is None:
@@ -73,7 +73,7 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
 
     @jax.jit
     def policy(obs: Array) -> Array:
-        return agent.policy_action(params, jnp.asarray(obs, jnp.float32))
+        return agent.views.policy_action(params, jnp.asarray(obs, jnp.float32))
 
     return policy
 
@@ -134,7 +134,7 @@ def _one_line(error: Exception) -> str:
 
 def _shapes(agent: Agent) -> Any:
     """What acting needs of one member, as shapes and types."""
-    return jax.eval_shape(lambda: agent.policy(agent.init(jax.random.key(0))))
+    return jax.eval_shape(lambda: agent.views.policy(agent.init(jax.random.key(0))))
 
 
 def _exported(agent: Agent, observation_size: int) -> bytes:
@@ -143,7 +143,7 @@ def _exported(agent: Agent, observation_size: int) -> bytes:
 
     def act(arrays: dict[str, Array], obs: Array) -> Array:
         params = from_paths(policy, arrays)
-        return agent.policy_action(params, obs)
+        return agent.views.policy_action(params, obs)
 
     (batch,) = jax.export.symbolic_shape("batch")
     obs = jax.ShapeDtypeStruct((batch, observation_size), jnp.float32)

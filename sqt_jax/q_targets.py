@@ -6,10 +6,12 @@
                     = coef * std_i Q_i(s', a')                 SQT-tuple  (paper eq. 19: one value per transition)
 
 Everything expects the whole batch, `next_q [N, B]` of the N *target* critics at (s', a'): SQT's penalty is a mean over
-the batch. The variants are functions of `next_q` to be bound with `functools.partial`:
+the batch. Penalties and reductions are functions of `next_q`; bind their settings with `functools.partial`:
 
     penalty = functools.partial(q_targets.batch_std, coef=0.5)
     y = q_targets.td_target(reward, discount, next_q, gamma=0.99, penalty=penalty)
+
+A new one is a function here and its row in `PENALTIES` or `REDUCTIONS` below.
 """
 
 from collections.abc import Callable
@@ -17,8 +19,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.types import Array
-
+Array = jax.Array
 Reduction = Callable[[Array], Array]  # next_q [N, B] -> [B]
 Penalty = Callable[[Array], Array]  # next_q [N, B] -> [B] or []
 
@@ -33,40 +34,45 @@ def mean_over_critics(next_q: Array) -> Array:
     return jnp.mean(next_q, axis=0)
 
 
+def first_critic(next_q: Array) -> Array:
+    """[N, B] -> [B]"""
+    return next_q[0]
+
+
 def min_over_subset(next_q: Array, subset: Array) -> Array:
     """The minimum over the critics of `subset [M]` (REDQ, https://arxiv.org/abs/2101.05982). [N, B] -> [B]"""
     return jnp.min(next_q[subset], axis=0)
 
 
 def random_subset(key: Array, ensemble_size: int, subset_size: int) -> Array:
-    """Indices [M] of `subset_size` different critics out of `ensemble_size`, each subset equally likely.
+    """Indices [M] of `subset_size` different critics out of `ensemble_size`; all subsets are equally likely.
 
     Raises:
-      ValueError: there are fewer critics than that.
+      ValueError: there are fewer critics.
     """
     if not 1 <= subset_size <= ensemble_size:
-        raise ValueError(f"a subset expects 1 to {ensemble_size} of the critics, not {subset_size}")
+        raise ValueError(f"expected a subset of 1 to {ensemble_size} critics, not {subset_size}")
     return jax.random.permutation(key, ensemble_size)[:subset_size]
 
 
 def std_over_critics(next_q: Array, ddof: int = 1) -> Array:
     """The disagreement of the ensemble, [N, B] -> [B].
 
-    `ddof=1` divides by N - 1 as torch's `std` does (and the authors' released code with it).
+    `ddof=1` divides by N - 1, as torch's `std` and with it the authors' released code do.
 
     Raises:
       ValueError: fewer than two critics (nothing can disagree) or `ddof` not below N.
     """
     ensemble_size = next_q.shape[0]
     if ensemble_size < 2:
-        raise ValueError("a penalty needs at least 2 critics: one alone has no disagreement")
+        raise ValueError("a penalty needs at least 2 critics: one critic has no disagreement")
     if not 0 <= ddof < ensemble_size:
         raise ValueError(f"ddof must be at least 0 and below the number of critics ({ensemble_size}), not {ddof}")
     return jnp.std(next_q, axis=0, ddof=ddof)
 
 
-def no_penalty(next_q: Array) -> Array:
-    """The plain algorithm: []"""
+def no_penalty(next_q: Array, *, coef: Array | float = 0.0, ddof: int = 1) -> Array:
+    """The baseline: []"""
     return jnp.zeros((), next_q.dtype)
 
 
@@ -84,6 +90,26 @@ def batch_std(next_q: Array, *, coef: Array | float, ddof: int = 1, axis_name: s
 def transition_std(next_q: Array, *, coef: Array | float, ddof: int = 1) -> Array:
     """SQT-tuple's penalty (eq. 19), one value per transition: [N, B] -> [B]"""
     return coef * std_over_critics(next_q, ddof)
+
+
+# The settings `penalty`, called with the settings `penalty_coef` and `ddof`.
+PENALTIES: dict[str, Callable[..., Array]] = {
+    "none": no_penalty,
+    "batch_std": batch_std,
+    "transition_std": transition_std,
+}
+# The settings `reduce`, called with next_q [N, B] and the update's random subset [M] of critics.
+REDUCTIONS: dict[str, Callable[..., Array]] = {
+    "min": lambda q, subset: min_over_critics(q),
+    "mean": lambda q, subset: mean_over_critics(q),
+    "subset_min": min_over_subset,
+}
+# The settings `actor_reduce`: what the actor maximises of the critics at its own action, [N, B] -> [B].
+ACTOR_REDUCTIONS: dict[str, Reduction] = {
+    "mean": mean_over_critics,  # paper eq. 9
+    "min": min_over_critics,  # SAC's paper
+    "first": first_critic,  # TD3's paper
+}
 
 
 def td_target(
@@ -105,8 +131,8 @@ def td_target(
       discount: [B], 0 where the episode terminated, else 1.
       next_q: [N, B], the target critics at (s', a').
       gamma: discount factor.
-      reduce: how N values become one.
-      penalty: how the ensemble's disagreement is subtracted.
+      reduce: [N, B] -> [B], how N values become one.
+      penalty: [N, B] -> [] or [B], what is subtracted.
       entropy_term: [B], SAC's temperature * log pi(a'|s'), subtracted.
       value_bounds: (low, high) between which the reduced value is clipped, before anything is subtracted (TD7).
       penalty_inside_gamma: discounted and masked with the value (eqs. 19, 20); else subtracted outside, from every
@@ -116,8 +142,8 @@ def td_target(
       [B].
 
     Raises:
-      ValueError: other shapes, which would broadcast to a target of something else. Under `jax.vmap`, map over members,
-        never over transitions: SQT's penalty needs the batch.
+      ValueError: shapes that would broadcast silently. Under `jax.vmap`, map over members, never over transitions:
+        SQT's penalty needs the batch.
     """
     shape = next_q.shape[1:]
     if next_q.ndim != 2 or not jnp.shape(reward) == jnp.shape(discount) == shape:

@@ -1,4 +1,4 @@
-"""The replay buffer that samples uniformly, on the device and written in place."""
+"""The uniform replay buffer, on the device and written in place."""
 
 import jax
 
@@ -7,7 +7,7 @@ from sqt_jax.types import Array, Replay, Transition
 
 
 def uniform(ring: Ring, batch_size: int) -> Replay:
-    """A buffer that samples uniformly with replacement among the transitions that `ring` holds."""
+    """A buffer that samples uniformly with replacement from the transitions in `ring`."""
 
     def insert(state: RingState, transition: Transition) -> RingState:
         return ring.insert(state, transition)[0]
@@ -17,9 +17,18 @@ def uniform(ring: Ring, batch_size: int) -> Replay:
         index = number % ring.capacity
         return ring.read(state, index), index
 
-    def feedback(state: RingState, index: Array, td_error: Array, gradient_steps: Array) -> RingState:
-        return state  # every transition stays as likely as any other
+    def feedback(state: RingState, index: Array, td_error: Array, step: Array) -> RingState:
+        return state  # all transitions stay equally likely
 
     return Replay(
-        ring.capacity, ring.init, insert, sample, feedback, ring.size, ring.rows, ring.with_rows, ring.without_rows
+        capacity=ring.capacity,
+        init=ring.init,
+        insert=insert,
+        sample=sample,
+        feedback=feedback,
+        size=ring.size,
+        rows=ring.rows,
+        with_rows=ring.with_rows,
+        without_rows=ring.without_rows,
+        member_axes=ring.member_axes(),
     )

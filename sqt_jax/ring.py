@@ -77,6 +77,10 @@ class Ring(NamedTuple):
             **counts,
         )
 
+    def member_axes(self) -> RingState:
+        """`vmap` axes: 0, and None for the count of transitions, which lockstep members share."""
+        return RingState(**dict.fromkeys(RingState._fields, 0) | {"inserted": None})  # type: ignore[arg-type]
+
     def insert(self, state: RingState, transition: Transition) -> tuple[RingState, Array]:
         """Takes E transitions, [E, ...]; gives also the numbers of those that lost their final observation, [E] or -1.
 

@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 
-from sqt_jax.networks import Dense, Gaussian, Network, clip_log_std, ensemble, network
+from sqt_jax.gaussian import Gaussian, clip_log_std
+from sqt_jax.networks import Dense, Network, ensemble, network
 from sqt_jax.types import Array, Params
 
 
 def avg_l1_norm(x: Array) -> Array:
-    """x / mean|x| along the last axis, which stays finite at 0."""
+    """x / mean|x| along the last axis (eq. 4); finite at 0."""
     return x / jnp.maximum(jnp.mean(jnp.abs(x), axis=-1, keepdims=True), 1e-8)
 
 

@@ -1,8 +1,8 @@
 """The training program: one train loop for all algorithms, and its vmap over the members of a sweep.
 
 A `Trainer` holds pure functions of one member. A `Sweep` is the same over S members, compiled: parameters, replay
-storage, environments and keys get a member axis; the counters do not, so that conditions on them stay real branches
-under `vmap` (a batched predicate would turn both branches into computed-and-selected ones).
+storage, environments and keys get a member axis. The counters do not, so conditions on them stay real branches under
+`vmap`; with a batched condition both branches would be computed.
 """
 
 from collections.abc import Callable
@@ -14,14 +14,14 @@ import jax.numpy as jnp
 from sqt_jax import rollout
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation, evaluate_and_judge
-from sqt_jax.members import Layout, member_axes
+from sqt_jax.members import Layout, every_leaf
 from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep
 
-TRAINING, EVALUATION = 0, 1  # what a member's key is folded with, so that the two streams never meet
+TRAINING, EVALUATION = 0, 1  # folded into a member's key, so that the two streams of numbers differ
 
 
 class Means(NamedTuple):
-    """Running means of metrics; a NaN is a value that was not measured."""
+    """Running means of metrics; a NaN was not measured and does not count."""
 
     mean: Metrics
     measured: Metrics  # how many values
@@ -33,7 +33,7 @@ class Means(NamedTuple):
 
     def add(self, metrics: Metrics) -> "Means":
         count = jax.tree.map(lambda n, x: n + ~jnp.isnan(x), self.measured, metrics)
-        # Never far from the values themselves, so that a long interval does not lose digits as a sum would.
+        # The running mean stays near the values: a long interval does not lose digits, as a sum would.
         mean = jax.tree.map(
             lambda m, n, x: m + jnp.where(jnp.isnan(x), 0.0, (x - m) / jnp.maximum(n, 1)), self.mean, count, metrics
         )
@@ -49,7 +49,8 @@ class TrainState(NamedTuple):
     episodes: rollout.Episodes
     replay: State
     key: Array  # the member's own; every draw folds a counter into it
-    env_steps: Array  # [] int32: transitions so far
+    env_steps: Array  # [] int32: transitions so far; members share it
+    gradient_steps: Array  # [] int32: updates so far; members share it
     diverged_at: Array  # [] int32: the env_steps at which the agent diverged and was frozen; -1: it has not
     means: Means  # of the updates' metrics, since `new_interval`
 
@@ -59,14 +60,15 @@ class Trainer(NamedTuple):
 
     init: Callable[..., TrainState]  # (key, scalars=None) -> state
     advance: Callable[[TrainState, Any, Any], TrainState]  # (state, num_steps, learn)
-    evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]  # and the bias of the critics' values
-    measure: Callable[[TrainState], Metrics]  # what is worth reporting of the interval, and of the state at its end
+    evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]  # with the bias of the critics' values
+    measure: Callable[[TrainState], Metrics]  # means over the interval, and the status at its end
+    member_axes: TrainState  # prefix tree of `vmap` axes of a state
 
 
 class Sweep(NamedTuple):
     """Training of S members in lockstep: the functions of `Trainer` with a leading [S], jit-compiled.
 
-    On several devices, states and what is told of them may have more than S members (`members.Layout`): theirs first.
+    With several devices S is padded to a multiple of their number (`members.Layout`): ignore entries after the first S.
     """
 
     init: Callable[[Array, Scalars], TrainState]  # (keys [S], scalars of [S] each)
@@ -76,7 +78,7 @@ class Sweep(NamedTuple):
 
 
 def new_interval(state: TrainState) -> TrainState:
-    """From here on, what `measure` tells of is measured anew."""
+    """Resets what `measure` averages."""
     means = jax.tree.map(jnp.zeros_like, state.means)
     return state._replace(episodes=state.episodes.forget_ended(), means=means)
 
@@ -86,7 +88,7 @@ def make_trainer(
 ) -> Trainer:
     """Joins an agent, an environment and a replay buffer into the training of one member.
 
-    `eval_env` is what evaluation plays, if not `env`: the same task on other physics.
+    Evaluation plays `eval_env`, by default `env`: the same task on other physics.
     """
     num_envs = config.num_envs
     updates = num_envs * config.updates_per_step  # per lockstep step, so that UTD is per transition
@@ -95,7 +97,7 @@ def make_trainer(
         agent_key, env_key, own_key = jax.random.split(key, 3)
         agent_state, replay_state = agent.init(agent_key, scalars), replay.init()
         batch, _ = jax.eval_shape(replay.sample, replay_state, own_key)
-        _, _, metrics = jax.eval_shape(agent.update, agent_state, batch, own_key)
+        _, _, metrics = jax.eval_shape(agent.update, agent_state, batch, own_key, jnp.int32(0))
         return TrainState(
             agent=agent_state,
             timestep=rollout.reset(env, env_key, num_envs),
@@ -103,12 +105,13 @@ def make_trainer(
             replay=replay_state,
             key=own_key,
             env_steps=jnp.zeros((), jnp.int32),
+            gradient_steps=jnp.zeros((), jnp.int32),
             diverged_at=jnp.full((), -1, jnp.int32),
             means=Means.start(metrics),
         )
 
     def key_for(purpose: int, state: TrainState) -> Array:
-        """A key that is used at this step of this member for this purpose only."""
+        """A key for this purpose at this step of this member only."""
         return jax.random.fold_in(jax.random.fold_in(state.key, purpose), state.env_steps)
 
     def step(state: TrainState, learn: Array) -> TrainState:
@@ -121,24 +124,27 @@ def make_trainer(
         timestep, transition = rollout.step(env, state.timestep, behaviour)
         over = timestep.terminated | timestep.truncated
         episodes, episode_return = state.episodes.add(transition.reward, over)
-        # An episode with random actions of the warm-up in it is no policy's.
+        # An episode that began in the warm-up has random actions in it: its return is not the policy's.
         begun = state.env_steps - num_envs * state.episodes.running_length.astype(jnp.int32)
-        agent_state = agent.observe(state.agent, episode_return, over & learn & (begun >= config.warmup_steps))
+        ended = over & learn & (begun >= config.warmup_steps)
+        agent_state = agent.observe(state.agent, episode_return, ended, state.gradient_steps)
         replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):
             agent_state, replay_state, means = carry
+            step = state.gradient_steps + i
             sample_key, noise_key = jax.random.split(jax.random.fold_in(update_key, i))
             batch, rows = replay.sample(replay_state, sample_key)
-            agent_state, td_error, metrics = agent.update(agent_state, batch, noise_key)
-            replay_state = replay.feedback(replay_state, rows, td_error, agent_state.gradient_steps)
+            agent_state, td_error, metrics = agent.update(agent_state, batch, noise_key, step)
+            replay_state = replay.feedback(replay_state, rows, td_error, step + 1)
             return agent_state, replay_state, means.add(metrics)
 
-        # No updates in the warm-up: a loop of no iterations, so that warm-up and training are one compiled program.
+        # The warm-up has no updates: a loop of 0 iterations, so that warm-up and training are one compiled program.
+        count = jnp.where(learn, updates, 0)
         carry = (agent_state, replay_state, state.means)
-        agent_state, replay_state, means = jax.lax.fori_loop(0, jnp.where(learn, updates, 0), update, carry)
+        agent_state, replay_state, means = jax.lax.fori_loop(0, count, update, carry)
         env_steps = state.env_steps + num_envs
-        newly = agent_state.diverged & (state.diverged_at < 0)
+        diverges_now = agent_state.diverged & (state.diverged_at < 0)
         return TrainState(
             agent=agent_state,
             timestep=timestep,
@@ -146,14 +152,15 @@ def make_trainer(
             replay=replay_state,
             key=state.key,
             env_steps=env_steps,
-            diverged_at=jnp.where(newly, env_steps, state.diverged_at),
+            gradient_steps=state.gradient_steps + count,
+            diverged_at=jnp.where(diverges_now, env_steps, state.diverged_at),
             means=means,
         )
 
     def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> TrainState:
         """`num_steps` lockstep steps, each of E transitions; without `learn`, random actions and no updates.
 
-        Both may be traced. Several calls in a row are as one, bit for bit.
+        Both may be traced. One call of n + m steps gives the same bits as calls of n and m steps.
         """
         learn = jnp.asarray(learn)
         return jax.lax.fori_loop(0, num_steps, lambda _, state: step(state, learn), state)
@@ -161,28 +168,29 @@ def make_trainer(
     def evaluate_policy(state: TrainState) -> tuple[Evaluation, Metrics]:
         """Deterministic episodes from starts that training never saw, new ones at each evaluation.
 
-        The critics are judged on them, and where they estimate the values of another policy, on as many of its own.
+        The bias of the critics is measured on them. If the critics estimate the values of a stochastic policy, it is
+        measured on as many further episodes of that policy.
         """
-        key, count = key_for(EVALUATION, state), config.eval_episodes
+        key, count, views = key_for(EVALUATION, state), config.eval_episodes, agent.views
 
         def policy(obs, key):
             action = agent.act(state.agent, obs[:count], key, deterministic=True)
-            if not agent.valued_act:
+            if not views.sample:
                 return action, jnp.zeros(count)
-            own, bonus = agent.valued_act(state.agent, obs[count:], key)
-            return jnp.concatenate([action, own]), jnp.concatenate([jnp.zeros(count), bonus])
+            sampled, bonus = views.sample(state.agent, obs[count:], key)
+            return jnp.concatenate([action, sampled]), jnp.concatenate([jnp.zeros(count), bonus])
 
         def critics(obs, action):
-            return agent.q_values(state.agent, obs, action)
+            return views.q_values(state.agent, obs, action)
 
-        episodes = 2 * count if agent.valued_act else count
+        episodes = 2 * count if views.sample else count
         gamma = state.agent.scalars.gamma
         played, bias = evaluate_and_judge(eval_env or env, policy, critics, gamma, key, episodes, judged=count)
         return jax.tree.map(lambda x: x[:count], played), bias
 
     def measure(state: TrainState) -> Metrics:
         """Means since `new_interval` (NaN where nothing was measured), and the status of agent and environments."""
-        status = agent.status(state.agent) | jax.tree.map(jnp.sum, jax.vmap(env.status)(state.timestep))
+        status = agent.views.status(state.agent) | jax.tree.map(jnp.sum, jax.vmap(env.status)(state.timestep))
         episodes = state.episodes
         return (
             state.means.result()
@@ -195,25 +203,28 @@ def make_trainer(
             }
         )
 
-    return Trainer(init, advance, evaluate_policy, measure)
+    return Trainer(
+        init=init,
+        advance=advance,
+        evaluate=evaluate_policy,
+        measure=measure,
+        member_axes=member_axes(replay),
+    )
 
 
-def state_axes(state: TrainState) -> Any:
-    """`member_axes` of a training state."""
-    # The environment is its author's: whatever its fields are called, every member has its own.
-    return member_axes(state)._replace(timestep=jax.tree.map(lambda _: 0, state.timestep))
+def member_axes(replay: Replay) -> TrainState:
+    """`vmap` axes of a training state: every member has its own, except the counters."""
+    axes = dict.fromkeys(TrainState._fields, 0) | {"replay": replay.member_axes}
+    return TrainState(**axes | {"env_steps": None, "gradient_steps": None})
 
 
 def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
     """Compiles a trainer over members; each function compiles once, whatever the number of steps.
 
-    Members share the leaves of `members.SHARED_LEAVES`, by name; a counter of another name becomes each member's own,
-    and a `lax.cond` on it computes both branches.
-
     Args:
-      layout: the members and the devices that they are spread over; None is any number of them on the default device.
+      layout: the members and their devices; None is any number of members on the default device.
     """
-    axes = state_axes(jax.eval_shape(trainer.init, jax.random.key(0)))
+    axes = every_leaf(trainer.member_axes, jax.eval_shape(trainer.init, jax.random.key(0)))
     layout = layout or Layout(1)
 
     def init(keys: Array, scalars: Scalars) -> TrainState:
@@ -234,25 +245,25 @@ def evaluation_steps(config: TrainConfig) -> list[int]:
 
 
 def segments(start: int, stop: int, config: TrainConfig) -> list[tuple[int, bool]]:
-    """What lies between two environment steps, as (lockstep steps, learn): warm-up first, then training."""
+    """The phases between two environment steps, as (lockstep steps, learn): warm-up first, then training."""
     boundary = min(max(start, config.warmup_steps), stop)
     parts = [((boundary - start) // config.num_envs, False), ((stop - boundary) // config.num_envs, True)]
     return [(count, learn) for count, learn in parts if count]
 
 
 class History(NamedTuple):
-    """What a whole training run gives, a row per evaluation."""
+    """The results of a training run, a row per evaluation."""
 
     env_steps: Array  # [evaluations]
     returns: Array  # [evaluations, episodes]
     lengths: Array  # [evaluations, episodes]
-    metrics: Metrics  # [evaluations] each, as `Trainer.measure` gives them
+    metrics: Metrics  # [evaluations] each, from `Trainer.measure` and the bias
 
 
 def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[TrainState, History]]:
-    """One member's whole run as one pure function `train(key, scalars=None)`, for `jax.jit(jax.vmap(train))`."""
+    """One member's run as one pure function `train(key, scalars=None)`, for `jax.jit(jax.vmap(train))`."""
     stops = evaluation_steps(config)
-    # Rows of two phases (warm-up, training), either of which may be empty.
+    # Each row has two phases (warm-up, training), either of which may be empty.
     counts = [[0, 0]]  # the evaluation before the first step
     for start, stop in zip(stops, stops[1:], strict=False):
         parts = {learn: count for count, learn in segments(start, stop, config)}

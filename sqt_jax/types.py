@@ -2,18 +2,18 @@
 
 Letters in shapes: `S` members of a sweep, `E` environments per member, `N` critics, `B` batch, `O` observation,
 `A` action; axis order `[S, N, B, ...]`. An interchangeable part (agent, replay, environment) is a NamedTuple of pure
-functions over an explicit state, in the manner of `optax.GradientTransformation`.
+functions over an explicit state, as in `optax.GradientTransformation`.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
 Array = jax.Array
 Params = Any  # a pytree of arrays
-State = Any  # a pytree of arrays that only its owner looks into, but for what `Agent` says
+State = Any  # a pytree of arrays that only its owner looks into
 Metrics = dict[str, Array]  # scalars by name
 
 
@@ -33,7 +33,7 @@ class Transition(NamedTuple):
 
 
 class TimeStep(NamedTuple):
-    """What an environment gives after `reset` or `step`.
+    """What an environment returns from `reset` and `step`.
 
     When an episode ends (`terminated` or `truncated`), `obs` is already the first observation of the next episode,
     `final_obs` the last one of the episode that ended. Elsewhere `final_obs` equals `obs`.
@@ -48,9 +48,9 @@ class TimeStep(NamedTuple):
 
 
 class Environment(NamedTuple):
-    """A task as pure functions of one environment; `vmap` gives many.
+    """A task as pure functions of one environment; `vmap` gives many. `envs.autoreset.make_environment` makes one.
 
-    `step` expects actions in [-1, 1] and starts a new episode by itself, with a new random start each time.
+    `step` expects actions in [-1, 1]. It starts the next episode itself, with a new random start each time.
     """
 
     name: str
@@ -60,73 +60,123 @@ class Environment(NamedTuple):
     reset: Callable[[Array], TimeStep]  # key -> first time step
     step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
     set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
-    status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts worth reporting, summed over environments
-    shortest_episode: int = 1  # steps that episodes take at least, in the mean: the replay has room for such (`Ring`)
+    status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts to report, summed over environments
+    # A lower bound on the mean episode length. 1 is always safe; a larger one saves memory in the replay (`Ring`).
+    shortest_episode: int = 1
+
+
+class Scalars(NamedTuple):
+    """The settings that are traced: a sweep over their values compiles once.
+
+    Traced values cannot be checked; `make_config` with each of them is the check. An algorithm ignores those that it
+    does not use.
+    """
+
+    penalty_coef: Array | float  # the paper's alpha: of algorithms with a penalty
+    lr: Array | float
+    gamma: Array | float
+    tau: Array | float  # of soft target updates: not with SALE networks (td7)
+    temperature: Array | float  # SAC's; its start where it is learned
+
+    def as_arrays(self) -> "Scalars":
+        return Scalars(*(jnp.asarray(value, jnp.float32) for value in self))
+
+
+class Init(Protocol):
+    def __call__(self, key: Array, scalars: Scalars | None = None) -> State:
+        """A new agent.
+
+        `scalars` replace the traced settings of the agent's configuration. The state must have `scalars.gamma` [] and
+        `diverged` [] bool, which the training program reads; everything else is the agent's own.
+        """
+
+
+class Act(Protocol):
+    def __call__(self, state: State, obs: Array, key: Array, deterministic: bool = False) -> Array:
+        """Actions [B, A] in [-1, 1] for obs [B, O]: exploring ones, or those of the policy that is evaluated."""
+
+
+class Update(Protocol):
+    def __call__(self, state: State, batch: Transition, key: Array, step: Array) -> tuple[State, Array, Metrics]:
+        """One update of all networks that are due.
+
+        Args:
+          batch: B transitions.
+          key: used once.
+          step: [] int32, the number of updates done before. Members of a sweep share it: do not map it under `vmap`,
+            else the conditions on it (delayed actor, hard copies) compute both branches.
+
+        Returns:
+          The state; td_error [B], the largest |Q_i - td_target| over the critics before the update (0 once the agent
+          has diverged); metrics, [] each, NaN where this update did not measure them.
+        """
+
+
+class Observe(Protocol):
+    def __call__(self, state: State, episode_return: Array, ended: Array, step: Array) -> State:
+        """What an agent learns from the progress of its episodes; called after each environment step.
+
+        Only TD7 uses it, for its policy checkpoints. Without it TD7 acts with its initial policy for ever.
+
+        Args:
+          episode_return: [E], undiscounted, of the running episodes up to this step.
+          ended: [E] bool, the episodes that ended with this step.
+          step: [] int32, the number of updates done so far.
+        """
+
+
+class Views(NamedTuple):
+    """Read-only functions of an agent's state: for evaluation, for records, for saving a policy."""
+
+    policy: Callable[[State], Params]  # state -> what the deterministic policy needs of it
+    policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
+    q_values: Callable[[State, Array, Array], Array]  # (state, obs [B, O], action [B, A]) -> the critics' [N, B]
+    # The stochastic policy whose values the critics estimate, if it is not the deterministic one:
+    # (state, obs [B, O], key) -> action [B, A], entropy bonus [B].
+    sample: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
+    status: Callable[[State], Metrics] = lambda state: {}  # what is reported of the state itself
 
 
 class Agent(NamedTuple):
-    """An algorithm as pure functions of one member; `vmap` gives a sweep.
+    """An algorithm as pure functions of one member; `vmap` gives a sweep."""
 
-    `update(state, batch, key)` is `update_with_noise(state, batch, draw_noise(key, batch))`: every random number of
-    an update is in the `noise`, so that a test can pass its own.
+    init: Init
+    act: Act
+    update: Update
+    views: Views
+    observe: Observe = lambda state, episode_return, ended, step: state
 
-    What the train loop reads of an agent's state, so that one of your own needs it too: `scalars.gamma`, `diverged` []
-    bool, and `gradient_steps` [] int32 (equal in all members, by that name: `members.SHARED_LEAVES`).
 
-    `td_error` is the largest |TD error| over the critics before the step, 0 once the agent has diverged. Metrics are []
-    each, NaN where this update did not measure them (`actor_loss` in an update without the actor's step).
+class Parts(NamedTuple):
+    """An agent, and the pieces of its update, which tests call with random draws of their own.
+
+    `agent.update(state, batch, key, step)` is `update(state, batch, draw(key, batch), step)`.
     """
 
-    init: Callable[..., State]  # (key, scalars=None) -> state
-    act: Callable[..., Array]  # (state, obs [B, O], key, deterministic=False) -> action [B, A]
-    update: Callable[[State, Transition, Array], tuple[State, Array, Metrics]]  # -> (state, td_error [B], metrics)
-    draw_noise: Callable[[Array, Transition], Any]  # (key, batch) -> noise
-    update_with_noise: Callable[[State, Transition, Any], tuple[State, Array, Metrics]]
-    # (state, batch, noise) -> [B], and its terms by name: penalty [] or [B]; next_log_prob [B] with an entropy term
+    agent: Agent
+    draw: Callable[[Array, Transition], Any]  # (key, batch) -> every random number of an update
+    update: Callable[[State, Transition, Any, Array], tuple[State, Array, Metrics]]  # (state, batch, draws, step)
+    # (state, batch, draws) -> td_target [B], and its terms by name: penalty [] or [B], next_log_prob [B] of SAC
     td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]
-    policy: Callable[[State], Params]  # state -> what deterministic acting needs of it
-    policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
-    q_values: Callable[[State, Array, Array], Array]  # (state, obs [B, O], action [B, A]) -> [N, B], the critics
-    # The policy whose values the critics estimate, where that samples: (state, obs [B, O], key) -> action [B, A] and
-    # its entropy bonus [B].
-    valued_act: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
-    # After each step of the environments: (state, returns of the running episodes [E], which of them ended [E] bool) ->
-    # state. TD7 assesses policies by it, and never acts otherwise than at the start without it.
-    observe: Callable[[State, Array, Array], State] = lambda state, episode_return, ended: state
-    status: Callable[[State], Metrics] = lambda state: {}  # what is worth reporting of a state
 
 
 class Replay(NamedTuple):
     """A store of transitions as pure functions of one member's state.
 
-    The k-th transition ever inserted lies in row k mod `capacity`. What was inserted stays as it is until it is
-    overwritten, so that checkpoints write each row once.
+    The k-th transition ever inserted is in row k mod `capacity`. A row does not change until it is overwritten, so
+    checkpoints write each row once.
     """
 
     capacity: int
     init: Callable[[], State]
     insert: Callable[[State, Transition], State]  # E new transitions at once
-    # (state, key) -> B transitions, their rows [B]; something has to be there (`size`), else they are all zeros
+    # (state, key) -> B transitions, their rows [B]. An empty replay (`size`) gives zeros.
     sample: Callable[[State, Array], tuple[Transition, Array]]
-    # (state, rows [B], td_error [B] as `Agent.update` gives it, gradient_steps) -> state
+    # (state, rows [B], td_error [B] as `Agent.update` returns it, updates done so far [] int32) -> state
     feedback: Callable[[State, Array, Array, Array], State]
-    size: Callable[[State], Array]  # state -> [] int32: the newest transitions that are all there
-    rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows to keep on disk [count, floats]
-    with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state: they are back
-    without_rows: Callable[[State], State]  # state -> what else is to be kept: None for the arrays of the rows
-
-
-class Scalars(NamedTuple):
-    """Settings that are traced, so that a sweep over their values compiles once.
-
-    Traced values cannot be checked, and an algorithm ignores those that it has no use for; `make_config` refuses both.
-    """
-
-    penalty_coef: Array | float  # of the variants with a penalty
-    lr: Array | float
-    gamma: Array | float
-    tau: Array | float  # of soft target updates: not with SALE networks (td7)
-    temperature: Array | float  # SAC's; the start value where it is learned
-
-    def as_arrays(self) -> "Scalars":
-        return Scalars(*(jnp.asarray(value, jnp.float32) for value in self))
+    size: Callable[[State], Array]  # state -> [] int32: how many of the newest transitions are complete
+    rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows for a checkpoint [count, floats]
+    with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state that has them again
+    without_rows: Callable[[State], State]  # state -> the same with None in place of the arrays that `rows` covers
+    # A prefix tree of the state for `vmap`: 0, or None for what the members of a sweep share (they insert in lockstep).
+    member_axes: Any = 0

@@ -13,9 +13,10 @@ import pytest
 
 from experiments.commandline.presets import preset_settings
 from sqt_jax import lap, q_targets
-from sqt_jax.agents import sac, td3, td7
-from sqt_jax.algorithms import AGENT_SETTINGS, ALGORITHMS
+from sqt_jax.agents import released, sac, td3, td7
+from sqt_jax.algorithms import ALGORITHMS, make_parts
 from sqt_jax.config import AgentConfig
+from sqt_jax.settings import settings_of
 from sqt_jax.trees import by_path
 from sqt_jax.types import Transition
 
@@ -40,7 +41,7 @@ def tree(arrays: dict, prefix: str) -> dict:
 
 
 def build(arrays: dict, name: str, **changes):
-    """The agent that a file describes, its state before the first update, and its batches [K, B, ...].
+    """The parts of the agent that a file describes, its state before the first update, and its batches [K, B, ...].
 
     `name` is the file's: `[released_]<algorithm>_<plain, sqt or sqt_tuple>`. All its networks have the same hidden
     widths, those of the critics.
@@ -53,33 +54,46 @@ def build(arrays: dict, name: str, **changes):
     algo = name.removeprefix("released_").removesuffix("_plain")
     row = ALGORITHMS[algo]
     preset = preset_settings("released", algo, "ant") if name.startswith("released_") else {}
-    settings = row.settings | {key: preset[key] for key in AGENT_SETTINGS & preset.keys()} | meta | changes
+    settings = dict(row.settings) | {key: preset[key] for key in settings_of(AgentConfig).keys() & preset.keys()} | meta | changes
     kernels = [nets["critic"][layer]["kernel"] for layer in sorted(nets["critic"])]
     settings["ensemble_size"] = kernels[0].shape[0]
     if "encoder" in nets:
         settings["embedding_size"] = nets["encoder"]["state2"]["bias"].shape[0]
         kernels = kernels[1:]  # layer0 lies before the embeddings
     config = AgentConfig(hidden=tuple(k.shape[-1] for k in kernels[:-1]), **settings)
-    agent = row.make_agent(config, batch["obs"].shape[-1], batch["action"].shape[-1])
-    state = agent.init(jax.random.key(0))
+    parts = make_parts(algo, config, batch["obs"].shape[-1], batch["action"].shape[-1])
+    state = parts.agent.init(jax.random.key(0))
     bounds = nets.pop("value_bounds", None)
+    networks = {name: {"params": params} for name, params in nets.items()}
     if config.value_clipping and bounds is not None:
-        state = state._replace(value_bounds=td7.ValueBounds(*bounds))
-    state = state._replace(**{name: {"params": params} for name, params in nets.items()})
-    return agent, config, state, batch
+        networks["value_bounds"] = td7.ValueBounds(*bounds)
+    return parts, config, with_learner(state, **networks), batch
 
 
-def noise_of(algo: str, batch: dict, k: int, config: AgentConfig):
+def learner_of(state):
+    """The state that learns: TD7's is inside its policy checkpoints."""
+    return getattr(state, "learner", state)
+
+
+def with_learner(state, **fields):
+    if hasattr(state, "learner"):
+        return state._replace(learner=state.learner._replace(**fields))
+    return state._replace(**fields)
+
+
+def draws_of(algo: str, batch: dict, k: int, config: AgentConfig):
     subset = jnp.arange(config.ensemble_size)
     if algo.startswith("sac"):
-        return sac.SACNoise(batch["next_action_eps"][k], batch["action_eps"][k], subset)
-    return td3.TD3Noise(batch["target_noise"][k], subset, batch["action_eps"][k] if config.sampled_actor else None)
+        return sac.SACDraws(batch["next_action_eps"][k], batch["action_eps"][k], subset)
+    if config.sampled_actor:
+        return released.GaussianTD3Draws(batch["target_noise"][k], subset, batch["action_eps"][k])
+    return td3.TD3Draws(batch["target_noise"][k], subset)
 
 
 def replay_trace(arrays: dict, name: str, **changes):
     """The largest deviation from the trace, in units of the tolerance (1 is the limit), by name."""
-    agent, config, state, batch = build(arrays, name, **changes)
-    update = jax.jit(agent.update_with_noise)
+    parts, config, state, batch = build(arrays, name, **changes)
+    update = jax.jit(parts.update)
     deviation: dict[str, float] = {}
 
     def compare(name, ours, theirs):
@@ -90,18 +104,19 @@ def replay_trace(arrays: dict, name: str, **changes):
 
     for k in range(batch["obs"].shape[0]):
         transition = Transition(*(batch[field][k] for field in Transition._fields))
-        noise = noise_of(name.removeprefix("released_"), batch, k, config)
-        target, ours = agent.td_target(state, transition, noise)
-        state, td_error, _ = update(state, transition, noise)
+        draws = draws_of(name.removeprefix("released_"), batch, k, config)
+        target, ours = parts.td_target(state, transition, draws)
+        state, td_error, _ = update(state, transition, draws, jnp.int32(k))
         ours |= {"td_target": target, "priority": lap.priority(td_error, config.priority_exponent, config.min_priority)}
         for key in [key for key in arrays if key.startswith("trace/")]:
             compare(key, ours[key.split("/")[1]], arrays[key][k])
+    learner = learner_of(state)
     for net, params in tree(arrays, "final").items():
         if net == "value_bounds":
-            ours = jnp.stack(state.value_bounds) if state.value_bounds else arrays["init/value_bounds"]  # unused
+            ours = jnp.stack(learner.value_bounds) if config.value_clipping else arrays["init/value_bounds"]  # unused
             compare(net, ours, params)
         else:
-            ours = getattr(state, net)["params"]
+            ours = getattr(learner, net)["params"]
             jax.tree.map(lambda a, b, net=net: compare("final/" + net, a, b), ours, params)
     return deviation
 
@@ -131,11 +146,11 @@ def slow(*values):
 
 
 def made_trace(name: str, **sizes) -> dict:
-    """A file of our own agent's: what it tells is whether sizes and settings are read from the file."""
+    """A trace of our own agent: it shows whether sizes and settings are read from the file."""
     row, updates, observation_size, action_size, batch_size = ALGORITHMS[name], 2, 5, 3, 7
-    config = AgentConfig(**row.settings | sizes)
-    agent = row.make_agent(config, observation_size, action_size)
-    first = state = agent.init(jax.random.key(3))
+    config = AgentConfig(**{**row.settings, **sizes})
+    parts = make_parts(name, config, observation_size, action_size)
+    first = state = parts.agent.init(jax.random.key(3))
     generator = np.random.default_rng(0)
     lead = updates, batch_size
     batch = {name: generator.normal(size=(*lead, observation_size)) for name in ("obs", "next_obs")}
@@ -146,17 +161,17 @@ def made_trace(name: str, **sizes) -> dict:
     settings = {"penalty_coef", "gamma", "lr", "policy_delay", *sizes} - {"hidden", "ensemble_size", "embedding_size"}
     arrays = {f"meta/{key}": np.asarray(getattr(config, key)) for key in settings}
     arrays |= {f"batch/{key}": value for key, value in batch.items()}
-    networks = [key for key in first._fields if isinstance(getattr(first, key), dict)]
+    networks = [key for key in learner_of(first)._fields if isinstance(getattr(learner_of(first), key), dict)]
     trace: dict[str, list] = {}
-    update = jax.jit(agent.update_with_noise)
+    update = jax.jit(parts.update)
     for k in range(updates):
         transition = Transition(*(batch[field][k] for field in Transition._fields))
-        noise = noise_of(name, batch, k, config)
-        target, terms = agent.td_target(state, transition, noise)
+        draws = draws_of(name, batch, k, config)
+        target, terms = parts.td_target(state, transition, draws)
         for key, value in {"td_target": target, "penalty": terms["penalty"]}.items():
             trace.setdefault(f"trace/{key}", []).append(np.asarray(value))
-        state, *_ = update(state, transition, noise)
-    for when, of in (("init", first), ("final", state)):
+        state, *_ = update(state, transition, draws, jnp.int32(k))
+    for when, of in (("init", learner_of(first)), ("final", learner_of(state))):
         for network in networks:
             arrays |= {
                 f"{when}/{network}/{path}": leaf for path, leaf in by_path(getattr(of, network)["params"]).items()

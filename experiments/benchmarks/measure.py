@@ -24,7 +24,7 @@ from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.config import Config
 from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
-from sqt_jax.members import Layout, member_axes, usable_devices
+from sqt_jax.members import Layout, usable_devices
 from sqt_jax.ring import Ring
 from sqt_jax.types import Array, Transition
 
@@ -264,18 +264,17 @@ def updates(algo: str, task: str, members: int, devices: int = 1, **settings: An
         return Transition(obs, jnp.tanh(action), reward, next_obs, jnp.ones(size))
 
     example = jax.eval_shape(agent.init, jax.random.key(0))
-    axes = member_axes(example)
     layout = Layout(members, tuple(jax.local_devices()[:devices]))
 
     def loop(state, batch, key, steps):
         def body(i, state):
-            return agent.update(state, batch, jax.random.fold_in(key, i))[0]
+            return agent.update(state, batch, jax.random.fold_in(key, i), i)[0]
 
         return jax.lax.fori_loop(0, steps, body, state)
 
-    run = jax.jit(layout.over_members(loop, (axes, 0, 0, None), axes))
+    run = jax.jit(layout.over_members(loop, (0, 0, 0, None), 0))
     keys = layout.filled(member_keys(members))
-    state = jax.jit(layout.over_members(agent.init, (0,), axes))(keys)
+    state = jax.jit(layout.over_members(agent.init, (0,), 0))(keys)
     batch = jax.jit(layout.over_members(random_batch, (0,), 0))(keys)
     one = jax.eval_shape(random_batch, jax.random.key(0))
     count = operations.of_update(agent, example, one, config.agent.policy_delay)
@@ -302,7 +301,7 @@ def replay_steps(kind: str, what: str, task: str, capacity: int, members: int) -
     env = envs.make(task)
     ring = Ring(capacity, env.observation_size, env.action_size, shortest_episode=env.shortest_episode)
     store = REPLAYS[kind](ring, BATCH)
-    axes = member_axes(jax.eval_shape(store.init))
+    axes = store.member_axes
     obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
 
     def insert(state, total, key, step):

@@ -20,7 +20,7 @@ PEAK_SHAPES = ((1, 256, 256), (5, 256, 256), (10, 256, 256), (1, 1024, 1024), (1
 
 def of_update(agent: Agent, state: State, batch: Transition, policy_delay: int) -> float:
     """Operations of one member's update: the mean over the updates with and without a step of the actor."""
-    jaxpr = jax.make_jaxpr(agent.update)(state, batch, jax.random.key(0)).jaxpr
+    jaxpr = jax.make_jaxpr(agent.update)(state, batch, jax.random.key(0), jnp.int32(0)).jaxpr
     return _of_products(jaxpr, share=1 / policy_delay)
 
 

@@ -1,8 +1,7 @@
 """A command line's text as `Options`.
 
-A flag that is not given is absent from the result: defaults belong to the algorithms. What is checked here needs
-nothing but the text of the command line, so that a typing error is answered before any heavy import; the limits of
-the settings are `sqt_jax.algorithms.make_config`'s.
+A flag that is not given is absent from the result: defaults belong to the algorithms. This module checks each flag by
+itself; `sqt_jax.make_config` checks them together.
 """
 
 import math
@@ -16,11 +15,11 @@ from absl import flags as absl_flags
 
 from experiments.commandline import config_file
 from experiments.commandline.arguments import UsageError
-from experiments.commandline.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag
+from experiments.commandline.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag, OutputConfig
 from experiments.commandline.presets import PRESETS
-from sqt_jax.config import ConfigError, check_value
+from sqt_jax.config import SETTINGS
 from sqt_jax.names import nearest
-from sqt_jax.types import Scalars
+from sqt_jax.settings import ConfigError, Setting, settings_of
 
 MAX_SEED = 2**32 - 1
 MAX_MEMBERS = 10_000
@@ -32,17 +31,17 @@ LATEST = "\n"  # no folder's name on a command line
 
 
 class Options(NamedTuple):
-    """A parsed command line. Only what was given is in `settings` and `sweep`; None is what was not."""
+    """A parsed command line. `settings` and `sweep` hold given flags only; others that were not given are None."""
 
-    algo: str | None  # not required with the folder of a run to resume; neither is env
+    algo: str | None  # algo and env are not required with --resume=FOLDER
     env: str | None
     seeds: tuple[int, ...] | None
     settings: dict[str, Any]  # one value for all members
-    sweep: dict[str, tuple[float, ...]]  # scalars with several values, in the order of `Scalars`
+    sweep: dict[str, tuple[float, ...]]  # swept settings with several values, in the order of `config.SETTINGS`
     preset: str
     out: str
     name: str | None
-    resume: str | None  # the folder of a run; LATEST: the one that these settings belong to
+    resume: str | None  # the folder of a run; LATEST: the latest run of these settings
     overwrite: bool
     checkpoint_every: int | None
     keep_checkpoints: int | None
@@ -66,7 +65,7 @@ class _Parser(absl_flags.ArgumentParser):
 
 def _values(argv: Sequence[str]) -> dict[str, Any]:
     """The flags that were given, parsed by type."""
-    # Own flag values: the libraries define flags of theirs in the global ones.
+    # Not the global flag values: libraries define their own flags there.
     values = absl_flags.FlagValues()
     values.set_gnu_getopt(True)
     known = [flag for group in FLAGS.values() for flag in group]
@@ -118,10 +117,14 @@ def _file_values(name: str) -> dict[str, Any]:
         raise UsageError(f"{error} (in {name})") from None
 
 
-def parse(argv: Sequence[str]) -> Options | None:
-    """A command line (program name first) as `Options`; None where it asks for help.
+def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
+    """A command line (program name first) as `Options`; None if it asks for help.
 
-    Raises `UsageError` for everything the text alone gives away.
+    Args:
+      needs_env: whether --env is required; it is not where an environment is handed in.
+
+    Raises:
+      UsageError: a flag is unknown, missing or invalid.
     """
     given = argv[1 : argv.index("--")] if "--" in argv else argv[1:]
     if any(word in ("--help", "-help", "--h", "-h", "-?") for word in given):
@@ -130,12 +133,12 @@ def parse(argv: Sequence[str]) -> Options | None:
     if "config" in values:
         values = _file_values(values.pop("config")) | values
     own = {name: values.pop(name, None) for name in ("algo", "env", "seeds", "preset", "out", "name")}
-    output = {name: values.pop(name, None) for name in OUTPUT}
+    output = {name: values.pop(name, None) for name in settings_of(OutputConfig)}
     resume, overwrite = values.pop("resume", None), values.pop("overwrite", False)
     if resume == "":
         raise UsageError("--resume=: expects the folder of a run, or nothing at all: --resume")
     folder_given = resume not in (None, LATEST)
-    for required in ("algo", "env"):
+    for required in ("algo", "env") if needs_env else ("algo",):
         if not own[required] and resume in (None, LATEST):
             raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
     if resume is not None and overwrite:
@@ -145,9 +148,9 @@ def parse(argv: Sequence[str]) -> Options | None:
     for name in ("out", "name", "preset"):
         if folder_given and own[name] is not None:
             raise UsageError(f"--{name}: has no effect with --resume={resume}")
-    for name, lowest in OUTPUT.items():
-        if output[name] is not None and output[name] < lowest:
-            raise UsageError(f"--{name}: expects a whole number of at least {lowest}, not {output[name]}")
+    for name, about in settings_of(OutputConfig).items():
+        if output[name] is not None:
+            _check(about, output[name])
 
     preset = own["preset"] or "paper"
     if preset not in PRESETS:
@@ -171,22 +174,20 @@ def parse(argv: Sequence[str]) -> Options | None:
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
     quiet = values.pop("quiet", False)
-    if values.get("temperature") == "auto":
-        del values["temperature"]
-        settings["learn_temperature"] = True
     for setting, value in values.items():
-        choices = value if setting in Scalars._fields else (value,)
-        try:
-            for choice in choices:
-                check_value(setting, choice)
-        except ConfigError as error:
-            raise UsageError(str(error)) from None
-        _refuse_duplicates(setting, choices)
+        about = SETTINGS[setting]
+        if about.auto and value == "auto":
+            settings[about.auto] = True
+            continue
+        choices = value if about.swept else (value,)
+        for choice in choices:
+            _check(about, choice)
+        _reject_duplicates(setting, choices)
         if len(choices) > 1:
             sweep[setting] = choices
         else:
             settings[setting] = choices[0]
-    sweep = {scalar: sweep[scalar] for scalar in Scalars._fields if scalar in sweep}
+    sweep = {name: sweep[name] for name in SETTINGS if name in sweep}
     count = math.prod(map(len, sweep.values())) * len(own["seeds"] or DEFAULT_SEEDS)
     if count > MAX_MEMBERS:
         raise UsageError(f"--seeds: expects at most {MAX_MEMBERS} members, seeds times swept values, not {count}")
@@ -206,23 +207,30 @@ def parse(argv: Sequence[str]) -> Options | None:
     )
 
 
+def _check(about: Setting, value: Any) -> None:
+    try:
+        about.check(value)
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
+
+
 def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
             raise UsageError(f"--seeds={seed}: expects whole numbers from 0 to {MAX_SEED}")
-    _refuse_duplicates("seeds", seeds)
+    _reject_duplicates("seeds", seeds)
     return seeds
 
 
 def _is_path(text: str) -> bool:
-    """Whether the system can have a file of that name; a YAML file can ask for others."""
+    """Whether a file can have this name; a YAML file can ask for one that cannot."""
     try:
         return b"\0" not in os.fsencode(text)
     except UnicodeEncodeError:
         return False
 
 
-def _refuse_duplicates(name: str, values: Sequence[Any]) -> None:
+def _reject_duplicates(name: str, values: Sequence[Any]) -> None:
     for value in values if len(set(values)) < len(values) else ():
         if values.count(value) > 1:
-            raise UsageError(f"--{name}: expects each value once, {value} is there {values.count(value)} times")
+            raise UsageError(f"--{name}: expects each value once, got {value} {values.count(value)} times")

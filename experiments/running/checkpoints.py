@@ -19,8 +19,8 @@ import numpy as np
 from experiments.running import files, manifests
 from experiments.running.loop import Position
 from experiments.running.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
-from sqt_jax.members import Layout, member_axes
-from sqt_jax.train import TrainState, state_axes
+from sqt_jax.members import Layout, every_leaf
+from sqt_jax.train import TrainState, member_axes
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Array, Replay, State
 
@@ -57,10 +57,10 @@ class Checkpoints:
             def own(state: State, first: Array) -> Array:
                 return replay.rows(state, first, count)
 
-            return layout.over_members(own, (member_axes(state), None), 0)(state, first)
+            return layout.over_members(own, (replay.member_axes, None), 0)(state, first)
 
         def with_rows(state: State, rows: Array, first: Array) -> State:
-            axes = member_axes(state)
+            axes = replay.member_axes
             return layout.over_members(replay.with_rows, (axes, 0, None), axes)(state, rows, first)
 
         self._rows_of = jax.jit(rows, static_argnames="count")
@@ -84,7 +84,7 @@ class Checkpoints:
             self._failed(position.env_steps, error)
             return
         rest = self._without_rows(state)
-        own = by_path(state_axes(rest))
+        own = by_path(every_leaf(member_axes(self.replay), rest))
         arrays = {name: self._host_copy(leaf, name in own) for name, leaf in _held(rest).items()}
         arguments = (Step(position.env_steps, len(same)), arrays, position, lengths)
         self._writer = threading.Thread(target=self._write, args=arguments, daemon=True)
@@ -196,7 +196,7 @@ class Checkpoints:
             raise
         except Exception as error:  # whatever Orbax says of a folder that is not its own
             raise Refused(f"Orbax cannot read its checkpoint ({type(error).__name__})") from None
-        own = by_path(state_axes(template))
+        own = by_path(every_leaf(member_axes(self.replay), template))
         leaves = {
             # What is not there has no entries, or comes with the rows.
             name: self._on_devices(arrays.get(name), leaf, name in own)

@@ -168,7 +168,7 @@ def train_loop(
     def send(returns: np.ndarray | None, lengths: np.ndarray | None, bias: dict[str, np.ndarray]) -> None:
         """What the state tells of the interval; nothing before the first step."""
         metrics = {name: of_members(value) for name, value in sweep.measure(state).items()} if done else {}
-        report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths, bias))
+        report(Report(done, int(state.gradient_steps), clock() - began, metrics, returns, lengths, bias))
 
     def save_here() -> None:
         if checkpoint_every:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from experiments.running import files
 from experiments.running.loop import Position
 
-FORMAT = 3  # another one where the training state, its files or the tables' columns are not what they were
+FORMAT = 4  # another one where the training state, its files or the tables' columns are not what they were
 MAX_BYTES = 10_000_000
 STEP = re.compile(r"step_(\d{10})(?:\.(\d))?")
 ROWS = re.compile(r"rows_(\d{10})_(\d{10})\.bin")

@@ -1,5 +1,6 @@
 """From a command line to a run that can begin: what is trained, where, and whether it can be."""
 
+import dataclasses
 import re
 from datetime import UTC, datetime
 from itertools import product
@@ -18,6 +19,7 @@ from sqt_jax import envs
 from sqt_jax.algorithms import check_physics, make_config, memory_estimate
 from sqt_jax.config import Config, ConfigError, TrainConfig
 from sqt_jax.members import Layout, usable_devices
+from sqt_jax.settings import settings_of
 from sqt_jax.types import Environment
 
 
@@ -127,8 +129,7 @@ def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Des
 
 def _output(options: flags.Options, run: Described | None, train: TrainConfig) -> dict[str, Any]:
     """The run's own flags: as given, as the resumed run has them, or the defaults."""
-    defaults = {"checkpoint_every": flag_table.CHECKPOINT_EVERY, "keep_checkpoints": flag_table.KEEP_CHECKPOINTS}
-    output: dict[str, Any] = {"tensorboard": True, "devices": None} | defaults
+    output: dict[str, Any] = dataclasses.asdict(flag_table.OutputConfig())
     if run:
         kept = {name: run.content["output"].get(name) for name in output}
         output |= {name: value for name, value in kept.items() if _may_be(name, value)}
@@ -170,7 +171,11 @@ def _exists(path: Path) -> bool:
 
 
 def _may_be(name: str, value: Any) -> bool:
-    return type(value) is type(flags.OUTPUT[name]) and value >= flags.OUTPUT[name]
+    try:
+        settings_of(flag_table.OutputConfig)[name].check(value)
+    except ConfigError:
+        return False
+    return True
 
 
 def not_a_run(path: Path) -> str:

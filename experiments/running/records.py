@@ -214,7 +214,7 @@ class Records:
         summary = {
             "status": "interrupted" if outcome.interrupted else "diverged" if outcome.diverged else "done",
             "env_steps": outcome.env_steps,
-            "gradient_steps": int(outcome.state.agent.gradient_steps),
+            "gradient_steps": int(outcome.state.gradient_steps),
             "wall_seconds": round(outcome.wall_seconds, 3),
             "train_seconds": round(outcome.train_seconds, 3),
             "steps_per_second": outcome.steps_per_second,

@@ -1,4 +1,4 @@
-"""What every agent's critics have in common: the target of the variant, one step, and what is reported of it."""
+"""What the critics of all agents share: the variant's target, and one update towards it."""
 
 import functools
 from collections.abc import Callable
@@ -7,130 +7,87 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from sqt_jax import losses, q_targets
+from sqt_jax import q_targets
 from sqt_jax.config import AgentConfig
-from sqt_jax.networks import Network
 from sqt_jax.optimizers import adam_step, overflows
 from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
 
 AgentState = TypeVar("AgentState", bound=Any)
 
-# A value of this size is a divergence long before it is infinite: no task here has returns near it.
-LARGEST_VALUE = 1e9
+LARGEST_VALUE = 1e9  # a larger |Q| is a divergence, long before it is infinite: no task here has returns near it
 
 
 def draw_subset(key: Array, config: AgentConfig) -> Array:
-    """The critics [M] of an update's target: a random subset where the reduction asks for one, else all."""
+    """The critics [M] of an update's target: REDQ's random subset, else all."""
     if config.reduce == "subset_min":
         return q_targets.random_subset(key, config.ensemble_size, config.subset_size)
     return jnp.arange(config.ensemble_size)
 
 
-def _reduction(config: AgentConfig, subset: Array) -> q_targets.Reduction:
-    reductions: dict[str, q_targets.Reduction] = {
-        "min": q_targets.min_over_critics,
-        "mean": q_targets.mean_over_critics,
-        "subset_min": functools.partial(q_targets.min_over_subset, subset=subset),
-    }
-    return reductions[config.reduce]
-
-
-def _penalty(config: AgentConfig, coef: Array | float) -> q_targets.Penalty:
-    penalties: dict[str, q_targets.Penalty] = {
-        "none": q_targets.no_penalty,
-        "batch_std": functools.partial(q_targets.batch_std, coef=coef, ddof=config.ddof),
-        "transition_std": functools.partial(q_targets.transition_std, coef=coef, ddof=config.ddof),
-    }
-    return penalties[config.penalty]
-
-
 def td_target(
-    config: AgentConfig,
-    scalars: Scalars,
-    batch: Transition,
-    next_q: Array,
-    subset: Array,
-    entropy_term: Array | float = 0.0,
-    value_bounds: tuple[Array, Array] | None = None,
+    config: AgentConfig, scalars: Scalars, batch: Transition, next_q: Array, subset: Array, **terms: Any
 ) -> tuple[Array, dict[str, Array]]:
-    """The variant's target from the target critics' values `next_q [N, B]` at (s', a').
+    """The variant's td_target [B] from the target critics' next_q [N, B] at (s', a'), and its penalty, [] or [B].
 
-    Returns:
-      td_target [B], and its terms by name: `penalty`, [] or [B].
+    `terms` are `entropy_term` and `value_bounds` of `q_targets.td_target`.
     """
-    penalty = _penalty(config, scalars.penalty_coef)
+    penalty = functools.partial(q_targets.PENALTIES[config.penalty], coef=scalars.penalty_coef, ddof=config.ddof)
     target = q_targets.td_target(
         batch.reward,
         batch.discount,
         next_q,
         gamma=scalars.gamma,
-        reduce=_reduction(config, subset),
+        reduce=functools.partial(q_targets.REDUCTIONS[config.reduce], subset=subset),
         penalty=penalty,
-        entropy_term=entropy_term,
-        value_bounds=value_bounds,
         penalty_inside_gamma=config.penalty_inside_gamma,
+        **terms,
     )
     return target, {"penalty": penalty(next_q)}
 
 
+def squared_error(q: Array, td_target: Array) -> Array:
+    """Sum over critics of the mean squared TD error: q [N, B], td_target [B] -> []."""
+    return jnp.sum(jnp.mean((q - td_target) ** 2, axis=-1))
+
+
 def update(
-    apply: Callable[[Params], Array],
-    loss: Callable[[Array], Array],
     config: AgentConfig,
     state: AgentState,
+    q_values: Callable[[Params], Array],
     target: Array,
     terms: dict[str, Array],
+    loss: Callable[[Array, Array], Array] = squared_error,
 ) -> tuple[AgentState, Array, Metrics]:
     """One Adam step of all critics towards the target.
 
     Args:
-      apply: parameters -> q [N, B], the critics at the batch's (s, a).
-      loss: q [N, B] -> [].
-      state: an agent's state, with fields `critic`, `critic_opt`, `scalars` and `diverged`.
-      target, terms: as `td_target` gives them.
+      state: with the fields `critic`, `critic_opt`, `scalars` and `diverged`.
+      q_values: parameters -> q [N, B], the critics at the batch's (s, a).
+      target, terms: from `td_target`.
+      loss: (q [N, B], target [B]) -> [].
 
     Returns:
-      state, td_error [B] (the largest |Q_i - target| over the critics), metrics. `q_std` is
-      eq. 18's std[B]: the mean over the batch of the std over the online critics at (s, a).
-      The agent has diverged where the loss or a gradient is not finite or a value passes `LARGEST_VALUE`: the critics
-      stay as they were, and td_error is 0.
+      The state, td_error [B] (`types.Update`) and metrics. `q_std` is the paper's eq. 18: the mean over the batch of
+      the std over the critics. If the loss or a gradient is not finite or a value exceeds `LARGEST_VALUE`, the agent
+      has diverged: the critics stay as they were, and td_error is 0.
     """
 
     def loss_fn(params):
-        q = apply(params)
-        return loss(q), q
+        q = q_values(params)
+        return loss(q, target), q
 
     (loss_value, q), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.critic)
-    within = jnp.isfinite(loss_value) & jnp.all(jnp.abs(q) < LARGEST_VALUE)  # a NaN is not
-    diverged = state.diverged | ~within | overflows(grads)
+    in_bounds = jnp.isfinite(loss_value) & jnp.all(jnp.abs(q) < LARGEST_VALUE)  # a NaN is not
+    diverged = state.diverged | ~in_bounds | overflows(grads)
     critic, critic_opt = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr, diverged)
     td_error = jnp.where(diverged, 0.0, jnp.max(jnp.abs(q - target), axis=0))
-    disagrees = config.ensemble_size > 1
+    several = config.ensemble_size > 1
     metrics = {
         "critic_loss": loss_value,
         "q_mean": jnp.mean(q),
-        "q_std": jnp.mean(q_targets.std_over_critics(q, config.ddof)) if disagrees else jnp.full((), jnp.nan),
+        "q_std": jnp.mean(q_targets.std_over_critics(q, config.ddof)) if several else jnp.full((), jnp.nan),
         "td_error": jnp.mean(td_error),
         "td_target": jnp.mean(target),
         "penalty": jnp.mean(terms["penalty"]),
     }
     return state._replace(critic=critic, critic_opt=critic_opt, diverged=diverged), td_error, metrics
-
-
-def update_by_squares(
-    critic_net: Network,
-    config: AgentConfig,
-    state: AgentState,
-    batch: Transition,
-    target: Array,
-    terms: dict[str, Array],
-) -> tuple[AgentState, Array, Metrics]:
-    """`update` of critics of (obs, action) alone, on the mean squared error."""
-    return update(
-        lambda params: critic_net.apply(params, batch.obs, batch.action),
-        lambda q: losses.critic_loss(q, target),
-        config,
-        state,
-        target,
-        terms,
-    )

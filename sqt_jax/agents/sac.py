@@ -1,4 +1,8 @@
-"""SAC (https://arxiv.org/abs/1801.01290) with N critics and the variant's target; temperature fixed or learned."""
+"""SAC (https://arxiv.org/abs/1812.05905), Algorithm 1, with N critics and the SQT variants' target.
+
+Temperature fixed (https://arxiv.org/abs/1801.01290) or learned. Differs from the paper: the actor maximises the mean of
+the critics (SQT paper, eq. 9), not the minimum; see BUILD_NOTES.md.
+"""
 
 from typing import NamedTuple
 
@@ -6,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sqt_jax import losses, networks
+from sqt_jax import networks, q_targets
 from sqt_jax.agents import critic as critics
-from sqt_jax.agents.actions import Actions
 from sqt_jax.config import AgentConfig
+from sqt_jax.gaussian import GaussianActor
 from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
-from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
+from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, Transition, Views
 
 
 class SACState(NamedTuple):
@@ -23,63 +27,40 @@ class SACState(NamedTuple):
     critic_opt: optax.OptState
     temperature_opt: optax.OptState
     scalars: Scalars
-    gradient_steps: Array  # [] int32: updates done
-    diverged: Array  # [] bool: nothing moves any more (`critic.update`)
+    diverged: Array  # [] bool: the agent is frozen (`critic.update`)
 
 
-class SACNoise(NamedTuple):
+class SACDraws(NamedTuple):
     next_action_eps: Array  # [B, A] standard normal: the next action
-    action_eps: Array  # [B, A] standard normal: the actor's own action
+    action_eps: Array  # [B, A] standard normal: the action of the actor's update
     subset: Array  # [M]: critics of the target
 
 
-def actions(config: AgentConfig) -> Actions:
-    """SAC's way of acting: samples of a Gaussian squashed by tanh."""
-
-    def greedy(output: networks.Gaussian) -> Array:
-        return output.mode()
-
-    def explore(output: networks.Gaussian, key: Array) -> Array:
-        return output.sample(jax.random.normal(key, output.mean.shape))[0]
-
-    def draw_noise(key: Array, batch: Transition) -> SACNoise:
-        next_key, own_key, subset_key = jax.random.split(key, 3)
-        shape = batch.action.shape
-        return SACNoise(
-            next_action_eps=jax.random.normal(next_key, shape),
-            action_eps=jax.random.normal(own_key, shape),
-            subset=critics.draw_subset(subset_key, config),
-        )
-
-    def next_action(output: networks.Gaussian, noise: SACNoise) -> tuple[Array, Array]:
-        return output.sample(noise.next_action_eps, config.squashed_log_prob)
-
-    def own_action(output: networks.Gaussian, noise: SACNoise) -> tuple[Array, Array]:
-        return output.sample(noise.action_eps, config.squashed_log_prob)
-
-    return Actions(
-        gaussian=True,
-        entropy=True,
-        greedy=greedy,
-        explore=explore,
-        draw_noise=draw_noise,
-        next_action=next_action,
-        own_action=own_action,
+def draw(key: Array, batch: Transition, config: AgentConfig) -> SACDraws:
+    """Every random number of an update."""
+    next_key, action_key, subset_key = jax.random.split(key, 3)
+    return SACDraws(
+        next_action_eps=jax.random.normal(next_key, batch.action.shape),
+        action_eps=jax.random.normal(action_key, batch.action.shape),
+        subset=critics.draw_subset(subset_key, config),
     )
 
 
-def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
-    """SAC for observations [B, O] and actions [B, A] of these sizes."""
-    acting = actions(config)
-    actor_net = networks.actor(action_size, config.hidden, acting.gaussian)
-    critic_net = networks.critic_ensemble(config.ensemble_size, config.hidden)
+def temperature_loss(log_temperature: Array, log_prob: Array, target_entropy: float) -> Array:
+    """The dual loss of the temperature (eq. 18): log_prob [B] -> []."""
+    return -jnp.exp(log_temperature) * jnp.mean(log_prob + target_entropy)
+
+
+def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
+    """SAC for observations [B, O] and actions [B, A]."""
+    actor_net = networks.network(GaussianActor(action_size, config.hidden))
+    critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden)
     target_entropy = -float(action_size)
 
     def init(key: Array, scalars: Scalars | None = None) -> SACState:
         actor_key, critic_key = jax.random.split(key)
         obs, action = jnp.zeros((1, observation_size)), jnp.zeros((1, action_size))
-        actor = actor_net.init(actor_key, obs)
-        critic = critic_net.init(critic_key, obs, action)
+        actor, critic = actor_net.init(actor_key, obs), critic_net.init(critic_key, obs, action)
         scalars = (scalars or config.scalars()).as_arrays()
         log_temperature = jnp.log(scalars.temperature) if config.learn_temperature else jnp.zeros(())
         return SACState(
@@ -91,40 +72,46 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
             critic_opt=adam_init(critic),
             temperature_opt=adam_init(log_temperature),
             scalars=scalars,
-            gradient_steps=jnp.zeros((), jnp.int32),
             diverged=jnp.zeros((), bool),
         )
-
-    def policy(state: SACState) -> Params:
-        return state.actor
-
-    def policy_action(actor: Params, obs: Array) -> Array:
-        return acting.greedy(actor_net.apply(actor, obs))
-
-    def act(state: SACState, obs: Array, key: Array, deterministic: bool = False) -> Array:
-        if deterministic:
-            return policy_action(policy(state), obs)
-        return acting.explore(actor_net.apply(state.actor, obs), key)
 
     def temperature(state: SACState) -> Array | float:
         return jnp.exp(state.log_temperature) if config.learn_temperature else state.scalars.temperature
 
-    def td_target(state: SACState, batch: Transition, noise: SACNoise) -> tuple[Array, dict[str, Array]]:
-        next_action, next_log_prob = acting.next_action(actor_net.apply(state.actor, batch.next_obs), noise)
+    def policy_action(actor: Params, obs: Array) -> Array:
+        return actor_net.apply(actor, obs).mode()
+
+    def sample(state: SACState, obs: Array, key: Array) -> tuple[Array, Array]:
+        """A sampled action [B, A] and its log-probability [B]."""
+        gaussian = actor_net.apply(state.actor, obs)
+        return gaussian.sample(jax.random.normal(key, gaussian.mean.shape))
+
+    def act(state: SACState, obs: Array, key: Array, deterministic: bool = False) -> Array:
+        return policy_action(state.actor, obs) if deterministic else sample(state, obs, key)[0]
+
+    def td_target(state: SACState, batch: Transition, draws: SACDraws) -> tuple[Array, dict[str, Array]]:
+        """The soft value of a sample of the current actor (eqs. 3, 5), minus the penalty (SQT paper, eqs. 19-20)."""
+        next_action, next_log_prob = actor_net.apply(state.actor, batch.next_obs).sample(draws.next_action_eps)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         entropy_term = temperature(state) * next_log_prob
-        target, terms = critics.td_target(config, state.scalars, batch, next_q, noise.subset, entropy_term)
+        target, terms = critics.td_target(config, state.scalars, batch, next_q, draws.subset, entropy_term=entropy_term)
         return target, terms | {"next_log_prob": next_log_prob}
 
-    def update_critic(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
-        target, terms = td_target(state, batch, noise)
-        return critics.update_by_squares(critic_net, config, state, batch, target, terms)
+    def update_critic(state: SACState, batch: Transition, draws: SACDraws) -> tuple[SACState, Array, Metrics]:
+        target, terms = td_target(state, batch, draws)
 
-    def update_actor(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Metrics]:
+        def q_values(critic):
+            return critic_net.apply(critic, batch.obs, batch.action)
+
+        return critics.update(config, state, q_values, target, terms)
+
+    def update_actor(state: SACState, batch: Transition, draws: SACDraws) -> tuple[SACState, Metrics]:
+        """The reparametrised policy loss (eq. 9), and the temperature's step where it is learned."""
+
         def loss_fn(actor):
-            action, log_prob = acting.own_action(actor_net.apply(actor, batch.obs), noise)
-            q = critic_net.apply(state.critic, batch.obs, action)
-            return jnp.mean(temperature(state) * log_prob - losses.actor_value(q, config.actor_reduce)), log_prob
+            action, log_prob = actor_net.apply(actor, batch.obs).sample(draws.action_eps)
+            value = q_targets.ACTOR_REDUCTIONS[config.actor_reduce](critic_net.apply(state.critic, batch.obs, action))
+            return jnp.mean(temperature(state) * log_prob - value), log_prob
 
         (loss, log_prob), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
         diverged = state.diverged | overflows(grads)
@@ -134,44 +121,36 @@ def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
         return update_temperature(state, log_prob) if config.learn_temperature else state, metrics
 
     def update_temperature(state: SACState, log_prob: Array) -> SACState:
-        grad = jax.grad(losses.temperature_loss)(state.log_temperature, log_prob, target_entropy)
+        grad = jax.grad(temperature_loss)(state.log_temperature, log_prob, target_entropy)
         diverged = state.diverged | overflows(grad)
         log_temperature, opt = adam_step(state.log_temperature, state.temperature_opt, grad, state.scalars.lr, diverged)
         return state._replace(log_temperature=log_temperature, temperature_opt=opt, diverged=diverged)
 
-    def update_with_noise(state: SACState, batch: Transition, noise: SACNoise) -> tuple[SACState, Array, Metrics]:
-        state, td_error, metrics = update_critic(state, batch, noise)
-        gradient_steps = state.gradient_steps + 1
+    def update(state: SACState, batch: Transition, draws: SACDraws, step: Array) -> tuple[SACState, Array, Metrics]:
+        state, td_error, metrics = update_critic(state, batch, draws)
 
-        def skip(state, batch, noise):
+        def skip(state, batch, draws):
             return state, dict.fromkeys(("actor_loss", "entropy", "temperature"), jnp.full((), jnp.nan))  # not measured
 
-        due = gradient_steps % config.policy_delay == 0  # a scalar that members share: a real branch under vmap
-        state, actor_metrics = jax.lax.cond(due, update_actor, skip, state, batch, noise)
+        actor_due = (step + 1) % config.policy_delay == 0  # members share it: a real branch under vmap
+        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, draws)
         target_critic = soft_update(state.target_critic, state.critic, state.scalars.tau, state.diverged)
-        state = state._replace(target_critic=target_critic, gradient_steps=gradient_steps)
-        return state, td_error, metrics | actor_metrics
+        return state._replace(target_critic=target_critic), td_error, metrics | actor_metrics
 
-    def q_values(state: SACState, obs: Array, action: Array) -> Array:
-        return critic_net.apply(state.critic, obs, action)
-
-    def valued_act(state: SACState, obs: Array, key: Array) -> tuple[Array, Array]:
-        output = actor_net.apply(state.actor, obs)
-        action, log_prob = output.sample(jax.random.normal(key, output.mean.shape), config.squashed_log_prob)
+    def sample_with_bonus(state: SACState, obs: Array, key: Array) -> tuple[Array, Array]:
+        action, log_prob = sample(state, obs, key)
         return action, -temperature(state) * log_prob
 
-    def update(state: SACState, batch: Transition, key: Array) -> tuple[SACState, Array, Metrics]:
-        return update_with_noise(state, batch, acting.draw_noise(key, batch))
-
-    return Agent(
-        init,
-        act,
-        update,
-        acting.draw_noise,
-        update_with_noise,
-        td_target,
-        policy,
-        policy_action,
-        q_values,
-        valued_act,
+    views = Views(
+        policy=lambda state: state.actor,
+        policy_action=policy_action,
+        q_values=lambda state, obs, action: critic_net.apply(state.critic, obs, action),
+        sample=sample_with_bonus,
     )
+    agent = Agent(
+        init=init,
+        act=act,
+        update=lambda state, batch, key, step: update(state, batch, draw(key, batch, config), step),
+        views=views,
+    )
+    return Parts(agent=agent, draw=lambda key, batch: draw(key, batch, config), update=update, td_target=td_target)

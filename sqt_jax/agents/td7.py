@@ -1,29 +1,59 @@
-"""TD7 (https://arxiv.org/abs/2306.02451) with N critics and the variant's target.
+"""TD7 (https://arxiv.org/abs/2306.02451), appendix A, Algorithm 1, with N critics and the SQT variants' target.
 
-TD3 with embeddings (SALE), prioritised replay (LAP: the replay is `sqt_jax.lap`), value bounds, hard target copies and
-policy checkpoints (`assessment`). Around SAC's way of acting, or without the checkpoints, the same update is what the
-authors of SQT released under the names of SAC and TD3: `--networks=sale`.
+TD3 plus four additions: embeddings (SALE, section 4.1: `sqt_jax.sale`), prioritised replay (LAP: `sqt_jax.lap`),
+clipped values with hard target copies, and policy checkpoints (section 4.2: `policy_checkpoints`, which names the one
+difference from the paper).
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from sqt_jax import losses, sale, trees
-from sqt_jax.agents import assessment, td3
+from sqt_jax import q_targets, sale, trees
 from sqt_jax.agents import critic as critics
-from sqt_jax.agents.actions import Actions, Output
+from sqt_jax.agents import policy_checkpoints, td3
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step, overflows
-from sqt_jax.types import Agent, Array, Metrics, Params, Scalars, Transition
+from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, Transition, Views
 
-Noise = Any  # what the way of acting draws; it has a `subset` of critics
+UNBOUNDED = 1e30  # far beyond `critic.LARGEST_VALUE`, and finite
+
+
+class ActionRules(NamedTuple):
+    """How the output of an actor network becomes actions [B, A]. TD7 has TD3's rules, `released` others.
+
+    An entropy term is [B], or 0.0 without one.
+    """
+
+    gaussian: bool  # whether the actor outputs a `Gaussian` or an action
+    mode: Callable[[Any], Array]  # output -> the deterministic action
+    explore: Callable[[Any, Array], Array]  # (output, key) -> the action in the environment
+    draw: Callable[[Array, Transition], Any]  # (key, batch) -> every random number of an update, with a `subset`
+    next_action: Callable[[Any, Any, Scalars], tuple[Array, Any]]  # (output, draws, scalars) -> a', entropy term
+    # The same for the actor's update, with metrics.
+    actor_action: Callable[[Any, Any, Scalars], tuple[Array, Any, Metrics]]
+    # With an entropy term: (output, key, scalars) -> a sampled action, its entropy bonus [B].
+    sample: Callable[[Any, Array, Scalars], tuple[Array, Array]] | None = None
+
+
+def deterministic(config: AgentConfig) -> ActionRules:
+    """TD3's rules: noise to explore, a smoothed next action, the actor's own action in its update."""
+    return ActionRules(
+        gaussian=False,
+        mode=lambda action: action,
+        explore=functools.partial(td3.explore, config=config),
+        draw=functools.partial(td3.draw, config=config),
+        next_action=lambda action, draws, scalars: (td3.smooth(action, draws.target_noise, config), 0.0),
+        actor_action=lambda action, draws, scalars: (action, 0.0, {}),
+    )
 
 
 class ValueBounds(NamedTuple):
-    """The smallest and largest targets seen so far, and the pair in use, which clips the next value."""
+    """The smallest and largest targets so far, and the pair in use, which clips the next value."""
 
     running_min: Array  # []
     running_max: Array  # []
@@ -34,6 +64,12 @@ class ValueBounds(NamedTuple):
     def start(cls) -> "ValueBounds":
         bound, zero = jnp.float32(1e8), jnp.zeros(())
         return cls(running_min=bound, running_max=-bound, low=zero, high=zero)
+
+    @classmethod
+    def unbounded(cls) -> "ValueBounds":
+        """Bounds that never clip and never change."""
+        bound = jnp.float32(UNBOUNDED)
+        return cls(running_min=-bound, running_max=bound, low=-bound, high=bound)
 
     def track(self, target: Array) -> "ValueBounds":
         return self._replace(
@@ -63,24 +99,44 @@ class TD7State(NamedTuple):
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     encoder_opt: optax.OptState
-    value_bounds: ValueBounds | None  # none where values are not clipped
-    checkpoints: assessment.Checkpoints | None  # none where policies are not assessed
+    value_bounds: ValueBounds
     scalars: Scalars
-    gradient_steps: Array  # [] int32: updates done
-    diverged: Array  # [] bool: nothing moves any more (`critic.update`)
+    diverged: Array  # [] bool: the agent is frozen (`critic.update`)
 
 
-def make(config: AgentConfig, observation_size: int, action_size: int) -> Agent:
-    """TD7 for observations [B, O] and actions [B, A] of these sizes."""
-    return make_sale_agent(config, observation_size, action_size, td3.actions(config), assessed=True)
+def encoder_loss(zsa: Array, next_zs: Array) -> Array:
+    """How far zsa [B, Z] is from the next observation's zs [B, Z], which gets no gradient (eq. 2): -> []."""
+    return jnp.mean((zsa - jax.lax.stop_gradient(next_zs)) ** 2)
 
 
-def make_sale_agent(
-    config: AgentConfig, observation_size: int, action_size: int, acting: Actions, assessed: bool
-) -> Agent:
-    """TD7 with any way of acting; where policies are not `assessed`, the learner acts and is evaluated."""
+def lap_huber(q: Array, td_target: Array, min_priority: float) -> Array:
+    """LAP's Huber loss, summed over critics, averaged over the batch: q [N, B], td_target [B] -> [].
+
+    Quadratic below `min_priority`, linear above, where LAP's sampling compensates for the smaller slope
+    (https://arxiv.org/abs/2007.06049, section 5).
+    """
+    error = jnp.abs(q - td_target)
+    return jnp.sum(jnp.mean(jnp.where(error < min_priority, 0.5 * error**2, min_priority * error), axis=-1))
+
+
+def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
+    """TD7 for observations [B, O] and actions [B, A]: the learner below with policy checkpoints."""
+    rules = deterministic(config)
+    learner = build_learner(config, observation_size, action_size, rules)
+    return policy_checkpoints.around(config, learner, rules.explore)
+
+
+def build_learner(
+    config: AgentConfig,
+    observation_size: int,
+    action_size: int,
+    rules: ActionRules,
+    train_encoder: bool = True,
+    clip_values: bool = True,
+) -> Parts:
+    """TD7 without policy checkpoints, and with any `rules`."""
     encoder_net = sale.encoder(config.embedding_size, config.hidden)
-    actor_net = sale.sale_actor(action_size, config.hidden, acting.gaussian)
+    actor_net = sale.sale_actor(action_size, config.hidden, rules.gaussian)
     critic_net = sale.sale_critics(config.ensemble_size, config.hidden)
 
     def init(key: Array, scalars: Scalars | None = None) -> TD7State:
@@ -100,171 +156,116 @@ def make_sale_agent(
             actor_opt=adam_init(actor),
             critic_opt=adam_init(critic),
             encoder_opt=adam_init(encoder),
-            value_bounds=ValueBounds.start() if config.value_clipping else None,
-            checkpoints=assessment.start(Policy(actor, encoder)) if assessed else None,
+            value_bounds=ValueBounds.start() if clip_values else ValueBounds.unbounded(),
             scalars=(scalars or config.scalars()).as_arrays(),
-            gradient_steps=jnp.zeros((), jnp.int32),
             diverged=jnp.zeros((), bool),
         )
 
-    def learner(state: TD7State) -> Policy:
-        return Policy(state.actor, state.fixed_encoder)
+    def policy(state: TD7State) -> Policy:
+        return Policy(actor=state.actor, encoder=state.fixed_encoder)
 
-    def output(policy: Policy, obs: Array) -> Output:
+    def output(policy: Policy, obs: Array) -> Any:
         return actor_net.apply(policy.actor, obs, encoder_net.zs(policy.encoder, obs))
 
-    def policy_action(policy: Policy, obs: Array) -> Array:
-        return acting.greedy(output(policy, obs))
-
-    def evaluated_policy(state: TD7State) -> Policy:
-        return state.checkpoints.checkpoint if state.checkpoints else learner(state)
-
     def act(state: TD7State, obs: Array, key: Array, deterministic: bool = False) -> Array:
-        if deterministic:
-            return policy_action(evaluated_policy(state), obs)
-        behaviour = state.checkpoints.snapshot if state.checkpoints else learner(state)
-        return acting.explore(output(behaviour, obs), key)
+        actor_output = output(policy(state), obs)
+        return rules.mode(actor_output) if deterministic else rules.explore(actor_output, key)
 
-    def observe(state: TD7State, episode_return: Array, ended: Array) -> TD7State:
-        if not state.checkpoints:
-            return state
-        if episode_return.shape != (1,) or ended.shape != (1,):
-            raise ValueError(f"td7 expects one environment: returns and ends of [1], not {episode_return.shape}")
-        checkpoints = assessment.assess(
-            config,
-            state.checkpoints,
-            learner(state),
-            state.gradient_steps,
-            episode_return[0],
-            ended[0] & ~state.diverged,
-        )
-        return state._replace(checkpoints=checkpoints)
-
-    def td_target(state: TD7State, batch: Transition, noise: Noise) -> tuple[Array, dict[str, Array]]:
-        bounds = state.value_bounds
+    def td_target(state: TD7State, batch: Transition, draws: Any) -> tuple[Array, dict[str, Array]]:
+        """The clipped minimum over the target critics, minus the penalty (SQT paper, eqs. 19-20)."""
         zs = encoder_net.zs(state.fixed_encoder_target, batch.next_obs)
         target_output = actor_net.apply(state.target_actor, batch.next_obs, zs)
-        next_action, next_log_prob = acting.next_action(target_output, noise)
+        next_action, entropy_term = rules.next_action(target_output, draws, state.scalars)
         zsa = encoder_net.zsa(state.fixed_encoder_target, zs, next_action)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action, zsa, zs)
-        target, terms = critics.td_target(
-            config,
-            state.scalars,
-            batch,
-            next_q,
-            noise.subset,
-            entropy_term=state.scalars.temperature * next_log_prob if acting.entropy else 0.0,
-            value_bounds=(bounds.low, bounds.high) if bounds else None,
+        bounds = state.value_bounds.low, state.value_bounds.high
+        return critics.td_target(
+            config, state.scalars, batch, next_q, draws.subset, entropy_term=entropy_term, value_bounds=bounds
         )
-        return target, terms | ({"next_log_prob": next_log_prob} if acting.entropy else {})
 
-    def update_encoder(state: TD7State, batch: Transition) -> tuple[TD7State, Array]:
+    def update_encoder(state: TD7State, batch: Transition) -> tuple[TD7State, Metrics]:
         def loss_fn(encoder):
             zsa = encoder_net.zsa(encoder, encoder_net.zs(encoder, batch.obs), batch.action)
-            return losses.encoder_loss(zsa, encoder_net.zs(encoder, batch.next_obs))
+            return encoder_loss(zsa, encoder_net.zs(encoder, batch.next_obs))
 
         loss, grads = jax.value_and_grad(loss_fn)(state.encoder)
         diverged = state.diverged | overflows(grads)
         encoder, encoder_opt = adam_step(state.encoder, state.encoder_opt, grads, state.scalars.lr, diverged)
-        return state._replace(encoder=encoder, encoder_opt=encoder_opt, diverged=diverged), loss
+        return state._replace(encoder=encoder, encoder_opt=encoder_opt, diverged=diverged), {"encoder_loss": loss}
 
-    def update_critic(state: TD7State, batch: Transition, zs: Array, noise: Noise) -> tuple[TD7State, Array, Metrics]:
-        target, terms = td_target(state, batch, noise)
+    def update_critic(state: TD7State, batch: Transition, zs: Array, draws: Any) -> tuple[TD7State, Array, Metrics]:
+        target, terms = td_target(state, batch, draws)
         zsa = encoder_net.zsa(state.fixed_encoder, zs, batch.action)
-        state, td_error, metrics = critics.update(
-            lambda params: critic_net.apply(params, batch.obs, batch.action, zsa, zs),
-            lambda q: losses.lap_huber(q, target, config.min_priority),
-            config,
-            state,
-            target,
-            terms,
-        )
-        bounds = state.value_bounds and trees.where(
-            state.diverged, state.value_bounds, state.value_bounds.track(target)
-        )
+
+        def q_values(critic):
+            return critic_net.apply(critic, batch.obs, batch.action, zsa, zs)
+
+        loss = functools.partial(lap_huber, min_priority=config.min_priority)
+        state, td_error, metrics = critics.update(config, state, q_values, target, terms, loss)
+        bounds = trees.where(state.diverged, state.value_bounds, state.value_bounds.track(target))
         return state._replace(value_bounds=bounds), td_error, metrics
 
-    def update_actor(state: TD7State, batch: Transition, zs: Array, noise: Noise) -> tuple[TD7State, Metrics]:
+    def update_actor(state: TD7State, batch: Transition, zs: Array, draws: Any) -> tuple[TD7State, Metrics]:
         def loss_fn(actor):
-            action, log_prob = acting.own_action(actor_net.apply(actor, batch.obs, zs), noise)
+            actor_output = actor_net.apply(actor, batch.obs, zs)
+            action, entropy_term, metrics = rules.actor_action(actor_output, draws, state.scalars)
             zsa = encoder_net.zsa(state.fixed_encoder, zs, action)
             q = critic_net.apply(state.critic, batch.obs, action, zsa, zs)
-            value = losses.actor_value(q, config.actor_reduce)
-            if acting.entropy:
-                value -= state.scalars.temperature * log_prob
-            return -jnp.mean(value), log_prob
+            return -jnp.mean(q_targets.ACTOR_REDUCTIONS[config.actor_reduce](q) - entropy_term), metrics
 
-        (loss, log_prob), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
+        (loss, metrics), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
         diverged = state.diverged | overflows(grads)
         actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
-        metrics = {"actor_loss": loss}
-        if acting.entropy:
-            metrics |= {"entropy": -jnp.mean(log_prob), "temperature": state.scalars.temperature}
-        return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), metrics
+        return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), {"actor_loss": loss} | metrics
 
     def copy_targets(state: TD7State) -> TD7State:
-        bounds = state.value_bounds
         copied = state._replace(
             target_actor=state.actor,
             target_critic=state.critic,
             fixed_encoder_target=state.fixed_encoder,
             fixed_encoder=state.encoder,
-            value_bounds=bounds.put_in_use() if bounds else None,
+            value_bounds=state.value_bounds.put_in_use(),
         )
         return trees.where(state.diverged, state, copied)
 
-    def update_with_noise(state: TD7State, batch: Transition, noise: Noise) -> tuple[TD7State, Array, Metrics]:
-        encoder_metrics = {}
-        if config.train_encoder:
-            state, encoder_metrics["encoder_loss"] = update_encoder(state, batch)
+    def update(state: TD7State, batch: Transition, draws: Any, step: Array) -> tuple[TD7State, Array, Metrics]:
+        state, encoder_metrics = update_encoder(state, batch) if train_encoder else (state, {})
         zs = encoder_net.zs(state.fixed_encoder, batch.obs)
-        state, td_error, metrics = update_critic(state, batch, zs, noise)
-        gradient_steps = state.gradient_steps + 1
+        state, td_error, metrics = update_critic(state, batch, zs, draws)
 
         def skip(state, *inputs):
             actor_metrics = jax.eval_shape(update_actor, state, *inputs)[1]
             return state, dict.fromkeys(actor_metrics, jnp.full((), jnp.nan))  # not measured
 
-        # Scalars that members share: real branches under vmap.
-        actor_due = gradient_steps % config.policy_delay == 0
-        copy_due = gradient_steps % config.target_update_period == 0
-        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, zs, noise)
+        # Members share both conditions: real branches under vmap.
+        actor_due = (step + 1) % config.policy_delay == 0
+        copy_due = (step + 1) % config.target_update_period == 0
+        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, zs, draws)
         state = jax.lax.cond(copy_due, copy_targets, lambda state: state, state)
-        if state.checkpoints:
-            lowered = assessment.lower_best(config, state.checkpoints, gradient_steps)
-            state = state._replace(checkpoints=lowered)
-        state = state._replace(gradient_steps=gradient_steps)
         return state, td_error, metrics | actor_metrics | encoder_metrics
-
-    def update(state: TD7State, batch: Transition, key: Array) -> tuple[TD7State, Array, Metrics]:
-        return update_with_noise(state, batch, acting.draw_noise(key, batch))
 
     def q_values(state: TD7State, obs: Array, action: Array) -> Array:
         zs = encoder_net.zs(state.fixed_encoder, obs)
         return critic_net.apply(state.critic, obs, action, encoder_net.zsa(state.fixed_encoder, zs, action), zs)
 
-    def valued_act(state: TD7State, obs: Array, key: Array) -> tuple[Array, Array]:
-        gaussian = output(learner(state), obs)
-        action, log_prob = gaussian.sample(jax.random.normal(key, gaussian.mean.shape), config.squashed_log_prob)
-        return action, -state.scalars.temperature * log_prob
+    def sample(state: TD7State, obs: Array, key: Array) -> tuple[Array, Array]:
+        assert rules.sample
+        return rules.sample(output(policy(state), obs), key, state.scalars)
 
     def status(state: TD7State) -> Metrics:
-        metrics: Metrics = assessment.status(state.checkpoints) if state.checkpoints else {}
-        if state.value_bounds:
-            metrics |= {"value_low": state.value_bounds.low, "value_high": state.value_bounds.high}
-        return metrics
+        return {"value_low": state.value_bounds.low, "value_high": state.value_bounds.high}
 
-    return Agent(
-        init,
-        act,
-        update,
-        acting.draw_noise,
-        update_with_noise,
-        td_target,
-        evaluated_policy,
-        policy_action,
-        q_values,
-        valued_act if acting.entropy else None,
-        observe,
-        status,
+    views = Views(
+        policy=policy,
+        policy_action=lambda policy, obs: rules.mode(output(policy, obs)),
+        q_values=q_values,
+        sample=sample if rules.sample else None,
+        status=status if clip_values else lambda state: {},
     )
+    agent = Agent(
+        init=init,
+        act=act,
+        update=lambda state, batch, key, step: update(state, batch, rules.draw(key, batch), step),
+        views=views,
+    )
+    return Parts(agent=agent, draw=rules.draw, update=update, td_target=td_target)
