@@ -8,21 +8,21 @@ from sqt_jax.algorithms import ALGORITHMS
 
 
 def first_rows(kind):
-    """The first row of each kind: the others differ from it in numbers only, and share what is tested of it."""
+    """The first row of each kind: the others differ from it in numbers only and share its tests."""
     found: dict = {}
     for algo, row in ALGORITHMS.items():
         found.setdefault(kind(row), algo)
     return list(found.values())
 
 
-KINDS = first_rows(lambda row: (row.make_agent, row.settings.get("penalty")))
+KINDS = first_rows(lambda row: (row.build, row.settings.get("penalty")))
 
 
 ONE_OF_EACH = ("td3", "sac_sqt", "td7_sqt_tuple")  # each agent and each penalty
 
 
 def every(names: Iterable[str] = ALGORITHMS, fast: Iterable[str] = KINDS):
-    """A test of each of these rows; by itself, those that differ from another one in sizes alone are slow tests.
+    """A test of each of these rows; by default, rows that differ from another one in sizes only are slow tests.
 
     `fast` are those that are not slow.
     """

@@ -1,5 +1,6 @@
 """What every row of the table of algorithms promises: shapes, laws, clocks and members."""
 
+import dataclasses
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -12,15 +13,15 @@ from algorithm_rows import KINDS, ONE_OF_EACH
 
 from sqt_jax import networks
 from sqt_jax.agents import sac, td3, td7
-from sqt_jax.algorithms import ALGORITHMS
-from sqt_jax.config import AgentConfig
-from sqt_jax.members import member_axes
-from sqt_jax.types import Agent, Scalars, Transition
+from sqt_jax.algorithms import ALGORITHMS, default_agent_config, features_of, make_parts
+from sqt_jax.config import SETTINGS, AgentConfig
+from sqt_jax.gaussian import GaussianActor
+from sqt_jax.types import Agent, Parts, Scalars, Transition
 
 O, A, B = 3, 2, 16
 KEY = jax.random.key(0)
-VARIANTS = [name for name in ALGORITHMS if "_sqt" in name]
-PLAIN = [name for name in ALGORITHMS if "_sqt" not in name]
+VARIANTS = [name for name, row in ALGORITHMS.items() if row.baseline]
+PLAIN = [name for name, row in ALGORITHMS.items() if not row.baseline]
 
 
 BASES = [algo for algo in KINDS if algo in PLAIN]
@@ -33,11 +34,11 @@ every_variant = pytest.mark.parametrize("algo", VARIANTS)
 
 
 def base_of(algo):
-    return algo.split("_sqt")[0]
+    return ALGORITHMS[algo].baseline or algo
 
 
 def test_no_agent_is_left_out():
-    assert {ALGORITHMS[algo].make_agent for algo in BASES} == {row.make_agent for row in ALGORITHMS.values()}
+    assert {ALGORITHMS[algo].build for algo in BASES} == {row.build for row in ALGORITHMS.values()}
     assert all(base_of(algo) in PLAIN for algo in VARIANTS)
 
 
@@ -57,6 +58,7 @@ class Subject(NamedTuple):
     """An agent of a small size, and its functions compiled once for all tests."""
 
     config: AgentConfig
+    parts: Parts
     agent: Agent
     update: jax.stages.Wrapped
     act: jax.stages.Wrapped
@@ -64,16 +66,18 @@ class Subject(NamedTuple):
 
 @cache
 def subject(algo, **changes) -> Subject:
-    config = AgentConfig(**({"hidden": (8, 8), "embedding_size": 8} | ALGORITHMS[algo].settings | changes))
-    agent = ALGORITHMS[algo].make_agent(config, O, A)
+    sizes = {"hidden": (8, 8), "embedding_size": 8}
+    config = dataclasses.replace(default_agent_config(algo), **sizes | changes)
+    parts = make_parts(algo, config, O, A)
     compiler = quick_jit if changes else jax.jit  # the rows themselves as they are used
-    return Subject(config, agent, compiler(agent.update), quick_jit(agent.act, static_argnames="deterministic"))
+    act = quick_jit(parts.agent.act, static_argnames="deterministic")
+    return Subject(config, parts, parts.agent, compiler(parts.agent.update), act)
 
 
 @cache
-def compiled_init(make_agent):
-    """Rows of one `make_agent` start alike but for the number of critics: a start is compiled once for all of them."""
-    return quick_jit(subject(next(algo for algo in BASES if ALGORITHMS[algo].make_agent is make_agent)).agent.init)
+def compiled_init(build):
+    """Rows of one `build` start alike except for the number of critics: a start is compiled once for all of them."""
+    return quick_jit(subject(next(algo for algo in BASES if ALGORITHMS[algo].build is build)).agent.init)
 
 
 def start(algo, seed=0, scalars=None, **changes):
@@ -81,29 +85,46 @@ def start(algo, seed=0, scalars=None, **changes):
 
     TD7's value bounds are open, as if targets had been seen.
     """
-    config, agent, *_ = subject(algo, **changes)
+    config, _, agent, *_ = subject(algo, **changes)
     scalars = (scalars or config.scalars()).as_arrays()
     n = config.ensemble_size
-    init = compiled_init(ALGORITHMS[algo].make_agent)
+    init = compiled_init(ALGORITHMS[algo].build)
     starts = [init(jax.random.key(seed + 1000 * i), scalars) for i in range(-(-n // 2))]
 
     def gather(like, *leaves):
         return leaves[0] if leaves[0].shape == like.shape else jnp.concatenate(leaves)[:n]
 
     state = jax.tree.map(gather, jax.eval_shape(agent.init, KEY), *starts)
-    if isinstance(state, td7.TD7State):
-        state = state._replace(value_bounds=td7.ValueBounds(*map(jnp.float32, (1e8, -1e8, -1e8, 1e8))))
+    if hasattr(state, "learner"):
+        bounds = td7.ValueBounds(*map(jnp.float32, (1e8, -1e8, -1e8, 1e8)))
+        state = state._replace(learner=state.learner._replace(value_bounds=bounds))
     return state
+
+
+def learner(state):
+    """The state that learns: TD7's is inside its policy checkpoints."""
+    return getattr(state, "learner", state)
+
+
+def with_learner(state, **fields):
+    if hasattr(state, "learner"):
+        return state._replace(learner=state.learner._replace(**fields))
+    return state._replace(**fields)
 
 
 def run(algo, state, steps, **changes):
     """The states and metrics after each of a few updates."""
     states, metrics = [state], []
     for k in range(steps):
-        state, _, measured = subject(algo, **changes).update(state, make_batch(k), jax.random.key(100 + k))
+        state, _, measured = subject(algo, **changes).update(state, make_batch(k), jax.random.key(100 + k), k)
         states.append(state)
         metrics.append(measured)
     return states, metrics
+
+
+def enough(algo):
+    """Updates in which every network moves."""
+    return max(4, 2 * subject(algo).config.policy_delay)
 
 
 def numbers(tree):
@@ -122,8 +143,8 @@ def assert_close(a, b, **tolerance):
 
 
 def learned(state):
-    """A state without the scalars, in which a plain algorithm and its variants differ."""
-    return state._replace(scalars=None)
+    """A state without the scalars, in which a baseline and its variants differ."""
+    return with_learner(state, scalars=None)
 
 
 # Shapes and soundness
@@ -147,15 +168,14 @@ def test_three_updates_are_finite_and_have_these_shapes(algo, n):
     first = state = start(algo, **changes)
     update = subject(algo, **changes).update
     measured = []
-    for k in range(3):
+    for k in range(max(3, subject(algo).config.policy_delay)):
         before = state
-        state, td_error, metrics = update(state, make_batch(k), jax.random.key(k))
+        state, td_error, metrics = update(state, make_batch(k), jax.random.key(k), k)
         measured.append(metrics)
         assert td_error.shape == (B,) and np.all(np.asarray(td_error) >= 0)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(lambda x: (x.shape, x.dtype), before)
     assert all(np.all(np.isfinite(leaf)) for tree in (first, state) for leaf in numbers(tree))
-    assert all(leaf.shape[0] == n for leaf in jax.tree.leaves(state.critic))
-    assert state.gradient_steps == 3
+    assert all(leaf.shape[0] == n for leaf in jax.tree.leaves(learner(state).critic))
     expected = {"critic_loss", "q_mean", "q_std", "td_error", "td_target", "penalty", "actor_loss"}
     for metrics in measured:
         assert expected <= set(metrics) and all(value.shape == () for value in metrics.values())
@@ -168,32 +188,32 @@ def test_three_updates_are_finite_and_have_these_shapes(algo, n):
 @every_algorithm
 def test_dtypes_do_not_promote_by_accident(algo):
     """All but the optimizer's step, which is optax's."""
-    config, agent, _, _ = subject(algo)
+    config, parts, agent, *_ = subject(algo)
     state, batch = jax.eval_shape(agent.init, KEY), make_batch(0)
     with jax.numpy_dtype_promotion("strict"):
-        noise = jax.eval_shape(agent.draw_noise, KEY, batch)
-        target, terms = jax.eval_shape(agent.td_target, state, batch, noise)
+        draws = jax.eval_shape(parts.draw, KEY, batch)
+        target, terms = jax.eval_shape(parts.td_target, state, batch, draws)
         action = jax.eval_shape(agent.act, state, batch.obs, KEY)
     assert target.shape == (B,) and target.dtype == action.dtype == jnp.float32
     assert terms["penalty"].shape == ((B,) if config.penalty == "transition_std" else ())
 
 
 @every_algorithm
-def test_update_is_update_with_its_own_noise(algo):
+def test_update_is_the_parts_update_with_its_own_draws(algo):
     """The same program, so that nothing needs to be compiled."""
-    agent = subject(algo).agent
-    arguments = jax.eval_shape(agent.init, KEY), make_batch(0), KEY
+    _, parts, agent, *_ = subject(algo)
+    arguments = jax.eval_shape(agent.init, KEY), make_batch(0), KEY, jnp.int32(0)
 
-    def with_noise(state, batch, key):
-        return agent.update_with_noise(state, batch, agent.draw_noise(key, batch))
+    def with_draws(state, batch, key, step):
+        return parts.update(state, batch, parts.draw(key, batch), step)
 
-    assert str(jax.make_jaxpr(agent.update)(*arguments)) == str(jax.make_jaxpr(with_noise)(*arguments))
+    assert str(jax.make_jaxpr(agent.update)(*arguments)) == str(jax.make_jaxpr(with_draws)(*arguments))
 
 
 @every_base
-def test_the_key_decides_the_noise(algo):
-    agent = subject(algo).agent
-    first, again, other = (agent.draw_noise(jax.random.key(seed), make_batch(0)) for seed in (0, 0, 1))
+def test_the_key_decides_the_draws(algo):
+    parts = subject(algo).parts
+    first, again, other = (parts.draw(jax.random.key(seed), make_batch(0)) for seed in (0, 0, 1))
     assert same(first, again) and not same(first, other)
     drawn = [leaf for leaf in numbers(first) if leaf.shape == (B, A)]
     assert len(np.unique(np.stack(drawn))) == len(drawn) * B * A  # no draw is used twice
@@ -202,7 +222,7 @@ def test_the_key_decides_the_noise(algo):
 @every_base
 def test_the_seed_decides_the_start(algo):
     assert same(start(algo, seed=3), start(algo, seed=3))
-    first, other = start(algo, seed=3), start(algo, seed=4)
+    first, other = learner(start(algo, seed=3)), learner(start(algo, seed=4))
     for name in ("actor", "critic"):
         pairs = zip(numbers(getattr(first, name)), numbers(getattr(other, name)), strict=True)
         assert not any(np.array_equal(x, y) for x, y in pairs)
@@ -241,13 +261,13 @@ def test_td3_explores_with_its_noise():
 
 
 def test_td3_smooths_the_target_action_within_its_clip():
-    agent, state, batch = subject("td3").agent, start("td3"), make_batch(0)
-    draws = np.asarray(agent.draw_noise(KEY, make_batch(0, size=4096)).target_noise)
+    parts, state, batch = subject("td3").parts, start("td3"), make_batch(0)
+    draws = np.asarray(parts.draw(KEY, make_batch(0, size=4096)).target_noise)
     assert abs(draws.std() - 0.2) < 0.01
 
     @quick_jit
     def target(scale):
-        return agent.td_target(state, batch, td3.TD3Noise(jnp.full((B, A), scale), jnp.arange(2)))[0]
+        return parts.td_target(state, batch, td3.TD3Draws(jnp.full((B, A), scale), jnp.arange(2)))[0]
 
     np.testing.assert_array_equal(target(0.5), target(0.9))
     np.testing.assert_array_equal(target(-0.5), target(-0.9))
@@ -260,83 +280,37 @@ def test_td3_smooths_the_target_action_within_its_clip():
 @every_variant
 def test_coefficient_zero_is_the_plain_algorithm_bit_for_bit(algo):
     """The target is so by arithmetic (test_q_targets); the rest because XLA compiles it alike in both programs."""
-    plain, _ = run(base_of(algo), start(base_of(algo)), 4)
-    ours, _ = run(algo, start(algo, scalars=subject(algo).config.scalars()._replace(penalty_coef=0.0)), 4)
+    plain, _ = run(base_of(algo), start(base_of(algo)), enough(algo))
+    ours, _ = run(algo, start(algo, scalars=subject(algo).config.scalars()._replace(penalty_coef=0.0)), enough(algo))
     assert same(learned(ours[-1]), learned(plain[-1]))
 
 
 @every_variant
 def test_a_positive_coefficient_changes_target_and_training(algo):
     assert subject(algo).config.penalty_coef > 0
-    plain, plain_metrics = run(base_of(algo), start(base_of(algo)), 4)
-    ours, metrics = run(algo, start(algo), 4)
+    plain, plain_metrics = run(base_of(algo), start(base_of(algo)), enough(algo))
+    ours, metrics = run(algo, start(algo), enough(algo))
     # The first update starts from equal critics: the mean target differs by gamma * mean(discount * penalty) exactly.
     assert metrics[0]["td_target"] < plain_metrics[0]["td_target"]
-    assert not same(ours[1].critic, plain[1].critic)
-    assert not same(ours[-1].actor, plain[-1].actor)
+    assert not same(learner(ours[1]).critic, learner(plain[1]).critic)
+    assert not same(learner(ours[-1]).actor, learner(plain[-1]).actor)
 
 
 @every_variant
 def test_the_target_is_the_plain_target_less_the_penalty(algo):
-    inside, outside = subject(algo).agent, subject(algo, penalty_inside_gamma=False).agent
-    plain, state, batch = subject(base_of(algo)).agent, start(algo), make_batch(0)
+    inside, outside = subject(algo).parts, subject(algo, penalty_inside_gamma=False).parts
+    plain, state, batch = subject(base_of(algo)).parts, start(algo), make_batch(0)
 
     @quick_jit
     def targets(state, batch):
-        noise = plain.draw_noise(KEY, batch)
-        return [agent.td_target(state, batch, noise) for agent in (plain, inside, outside)]
+        draws = plain.draw(KEY, batch)
+        return [parts.td_target(state, batch, draws) for parts in (plain, inside, outside)]
 
     (theirs, _), (ours, terms), (ours_outside, terms_outside) = targets(state, batch)
     penalty = np.broadcast_to(terms["penalty"], B)
     assert np.all(penalty > 0) and same(terms["penalty"], terms_outside["penalty"])
     np.testing.assert_allclose(theirs - ours, 0.99 * batch.discount * penalty, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(theirs - ours_outside, penalty, rtol=1e-3, atol=1e-6)
-
-
-def test_a_sampled_actor_acts_by_its_mode_and_learns_from_its_samples():
-    config, agent, update, act = subject("td3", sampled_actor=True)
-    net = networks.actor(A, config.hidden, gaussian=True)
-    state, batch = agent.init(KEY), make_batch(0)
-    mode = net.apply(state.actor, batch.obs).mode()
-    np.testing.assert_allclose(act(state, batch.obs, KEY, deterministic=True), mode, rtol=1e-5, atol=1e-6)
-    explored = act(state, batch.obs, KEY) - mode
-    assert 0 < np.abs(explored).max() < 6 * config.exploration_noise
-    noise = agent.draw_noise(KEY, batch)
-    assert noise.action_eps.shape == (B, A)
-    state = state._replace(gradient_steps=jnp.int32(1))  # the actor's turn
-    with_noise = quick_jit(agent.update_with_noise)
-    one, other = (with_noise(state, batch, noise._replace(action_eps=noise.action_eps * c))[0] for c in (1, -1))
-    assert same(one.critic, other.critic) and not same(one.actor, other.actor)
-    assert subject("td3").agent.draw_noise(KEY, batch).action_eps is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("algo", "n"),
-    [
-        ("td3_sqt", 3),
-        ("redq_sqt", 10),
-        ("sac_sqt_tuple", 2),
-        ("maxmin_sqt", 4),
-    ],
-)
-def test_with_sale_networks_updates_are_finite_and_coefficient_0_is_the_plain_algorithm(algo, n):
-    sale = {"networks": "sale", "ensemble_size": n}
-    base = subject(base_of(algo), **sale)
-    first = quick_jit(subject(algo, **sale).agent.init)(KEY)
-
-    def after(update, coef):
-        state = first._replace(scalars=first.scalars._replace(penalty_coef=jnp.float32(coef)))
-        for k in range(3):
-            state, td_error, metrics = update(state, make_batch(k), jax.random.key(k))
-            assert td_error.shape == (B,) and np.isfinite(metrics["critic_loss"])
-        return state._replace(scalars=None)
-
-    update = subject(algo, **sale).update
-    plain, zero, half = after(base.update, 0), after(update, 0), after(update, 0.5)
-    assert same(plain, zero) and not same(plain, half)
-    assert all(np.all(np.isfinite(leaf)) for leaf in numbers(half))
-    assert all(leaf.shape[0] == n for leaf in jax.tree.leaves(half.critic))
 
 
 # Clocks
@@ -346,13 +320,14 @@ def target_period(algo):
     """Updates between two moves of the target networks."""
     config = subject(algo).config
     periods = {td3.TD3State: config.policy_delay, sac.SACState: 1, td7.TD7State: config.target_update_period}
-    return periods[type(start(algo))]
+    return periods[type(learner(start(algo)))]
 
 
 @every_plain
 def test_the_actor_and_the_targets_move_only_when_they_should(algo):
     config = subject(algo).config
-    states, metrics = run(algo, start(algo), 4)
+    states, metrics = run(algo, start(algo), 6)
+    states = [learner(state) for state in states]
     for k, (before, after) in enumerate(zip(states, states[1:], strict=False), start=1):
         assert not same(before.critic, after.critic)
         due = k % config.policy_delay == 0
@@ -380,28 +355,25 @@ def test_targets_make_soft_steps_towards_the_updated_networks(algo):
 @every_base
 def test_the_delayed_actor_is_a_real_branch_also_over_members(algo):
     agent = subject(algo).agent
-    axes = member_axes(jax.eval_shape(agent.init, KEY))
-    update = jax.vmap(agent.update, in_axes=(axes, None, 0), out_axes=(axes, 0, 0))
-    states = jax.eval_shape(jax.vmap(agent.init, out_axes=axes), jax.random.split(KEY, 3))
-    jaxpr = jax.make_jaxpr(update)(states, make_batch(0), jax.random.split(KEY, 3))
+    update = jax.vmap(agent.update, in_axes=(0, None, 0, None))
+    states = jax.eval_shape(jax.vmap(agent.init), jax.random.split(KEY, 3))
+    jaxpr = jax.make_jaxpr(update)(states, make_batch(0), jax.random.split(KEY, 3), jnp.int32(1))
     assert [equation for equation in jaxpr.eqns if equation.primitive.name == "cond"]
 
 
 @pytest.mark.parametrize("algo", ["td3", "sac"])  # TD7's copies and actor: test_td7
 def test_the_actor_climbs_the_mean_of_the_updated_critics(algo):
     """Adam's first step has the sign of the gradient: of the mean over critics and batch, without an entropy term."""
-    config, agent, *_ = subject(algo)
+    config, parts, *_ = subject(algo)
     states, _ = run(algo, start(algo, scalars=config.scalars()._replace(temperature=0.0)), config.policy_delay)
     k = config.policy_delay - 1  # the update that moved the actor
     batch, key, before, after = make_batch(k), jax.random.key(100 + k), states[k], states[k + 1]
-    noise = agent.draw_noise(key, batch)
+    draws = parts.draw(key, batch)
     policies = {
         "td3": lambda actor: networks.TanhActor(A, config.hidden).apply(actor, batch.obs),
-        "sac": lambda actor: (
-            networks.GaussianActor(A, config.hidden).apply(actor, batch.obs).sample(noise.action_eps)[0]
-        ),
+        "sac": lambda actor: GaussianActor(A, config.hidden).apply(actor, batch.obs).sample(draws.action_eps)[0],
     }
-    critics = networks.critic_ensemble(2, config.hidden)
+    critics = networks.ensemble(networks.Critic, 2, config.hidden)
 
     @quick_jit
     @jax.grad
@@ -418,7 +390,8 @@ def test_the_actor_climbs_the_mean_of_the_updated_critics(algo):
 @every_algorithm
 def test_each_networks_first_step_has_the_learning_rates_length(algo):
     scalars = subject(algo).config.scalars()._replace(lr=1e-3)
-    states, _ = run(algo, start(algo, scalars=scalars), 2)
+    states, _ = run(algo, start(algo, scalars=scalars), subject(algo).config.policy_delay)
+    states = [learner(state) for state in states]
     for name in ("critic", "actor"):
         moved = [state for state in states if not same(getattr(state, name), getattr(states[0], name))][0]
         steps = jax.tree.map(lambda a, b: jnp.max(jnp.abs(a - b)), getattr(moved, name), getattr(states[0], name))
@@ -426,10 +399,6 @@ def test_each_networks_first_step_has_the_learning_rates_length(algo):
 
 
 # Members
-
-
-def over_members(function, axes, *states):
-    return jax.tree.map(function, axes, *states, is_leaf=lambda axis: axis is None)
 
 
 @algorithm_rows.every(KINDS, fast=ONE_OF_EACH)
@@ -444,19 +413,19 @@ def test_members_side_by_side_are_each_member_alone(algo):
         )
     ]
     alone = [start(algo, seed, scalars) for seed, scalars in enumerate(settings)]
-    axes = member_axes(jax.eval_shape(agent.init, KEY))
-    together = over_members(lambda axis, *leaves: leaves[0] if axis is None else jnp.stack(leaves), axes, *alone)
-    update_all = quick_jit(jax.vmap(agent.update, in_axes=(axes, 0, 0), out_axes=(axes, 0, 0)))
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
+    update_all = quick_jit(jax.vmap(agent.update, in_axes=(0, 0, 0, None)))
     for k in range(4):
         batches = [make_batch(10 * k + i) for i in range(3)]
         keys = jax.random.split(jax.random.key(k), 3)
-        together, td_error, _ = update_all(together, jax.tree.map(lambda *leaves: jnp.stack(leaves), *batches), keys)
-        own = [update(state, batch, key) for state, batch, key in zip(alone, batches, keys, strict=True)]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batches)
+        together, td_error, _ = update_all(together, stacked, keys, k)
+        own = [update(state, batch, key, k) for state, batch, key in zip(alone, batches, keys, strict=True)]
         alone = [state for state, _, _ in own]
         for i in range(3):
             np.testing.assert_allclose(td_error[i], own[i][1], rtol=1e-4, atol=1e-5)
     for i in range(3):
-        member = over_members(lambda axis, leaf, i=i: leaf if axis is None else leaf[i], axes, together)
+        member = jax.tree.map(lambda leaf, i=i: leaf[i], together)
         assert_close(member, alone[i], rtol=1e-4, atol=1e-5)
 
 
@@ -465,11 +434,14 @@ def test_members_side_by_side_are_each_member_alone(algo):
 def test_a_swept_scalar_shares_one_compilation_and_matters(algo, name):
     update = subject(algo).update
     default = subject(algo).config.scalars()
-    before = run(algo, start(algo), 2)[0][-1]
+    updates = subject(algo).config.policy_delay
+    before = run(algo, start(algo), updates)[0][-1]
     compilations = update._cache_size()
-    after = run(algo, start(algo, scalars=default._replace(**{name: 0.7 * getattr(default, name) + 0.05})), 2)[0][-1]
+    after = run(algo, start(algo, scalars=default._replace(**{name: 0.7 * getattr(default, name) + 0.05})), updates)[0][
+        -1
+    ]
     assert update._cache_size() == compilations == 1
-    unused = name in ALGORITHMS[algo].ignores or (name == "penalty_coef" and algo in PLAIN)
+    unused = not set(SETTINGS[name].features) <= features_of(ALGORITHMS[algo], subject(algo).config)
     assert same(learned(after), learned(before)) == unused
 
 
@@ -497,7 +469,7 @@ def test_a_learned_temperature_moves_towards_its_entropy_target(learning_tempera
     state = make(log_std, temperature=0.3)
     seen = []
     for k in range(5):
-        state, _, metrics = own.update(state, make_batch(k), jax.random.key(k))
+        state, _, metrics = own.update(state, make_batch(k), jax.random.key(k), k)
         assert (metrics["entropy"] < -A) == (direction > 0)  # the target is minus the number of actions
         seen.append(float(metrics["temperature"]))
     np.testing.assert_allclose(seen[0], 0.3, rtol=1e-6)  # the scalar is where learning starts
@@ -511,12 +483,12 @@ def test_a_fixed_temperature_stays():
 
 
 def test_the_temperature_weighs_the_entropy_in_the_target():
-    config, agent, *_ = subject("sac")
+    config, parts, *_ = subject("sac")
     default, batch = config.scalars(), make_batch(0)
-    noise = agent.draw_noise(KEY, batch)
-    compute = quick_jit(agent.td_target)
+    draws = parts.draw(KEY, batch)
+    compute = quick_jit(parts.td_target)
     (without, _), (with_it, terms) = (
-        compute(start("sac", scalars=default._replace(temperature=value)), batch, noise) for value in (0.0, 0.5)
+        compute(start("sac", scalars=default._replace(temperature=value)), batch, draws) for value in (0.0, 0.5)
     )
     expected = -0.99 * batch.discount * 0.5 * terms["next_log_prob"]
     np.testing.assert_allclose(with_it - without, expected, rtol=1e-4, atol=1e-5)
@@ -528,12 +500,12 @@ def test_the_temperature_weighs_the_entropy_in_the_target():
 @every_base
 def test_a_random_subset_of_critics_makes_the_target(algo):
     changes = {"ensemble_size": 5, "reduce": "subset_min", "subset_size": 2}
-    agent, state, batch = subject(algo, **changes).agent, start(algo, ensemble_size=5), make_batch(0)
-    noise = agent.draw_noise(KEY, batch)
-    assert noise.subset.shape == (2,) and len(set(noise.subset.tolist())) == 2
-    compute = quick_jit(agent.td_target)
+    parts, state, batch = subject(algo, **changes).parts, start(algo, ensemble_size=5), make_batch(0)
+    draws = parts.draw(KEY, batch)
+    assert draws.subset.shape == (2,) and len(set(draws.subset.tolist())) == 2
+    compute = quick_jit(parts.td_target)
     indices = [(i, j) for i in range(5) for j in range(i, 5)]
-    pairs = {pair: compute(state, batch, noise._replace(subset=jnp.array(pair)))[0] for pair in indices}
+    pairs = {pair: compute(state, batch, draws._replace(subset=jnp.array(pair)))[0] for pair in indices}
     for (i, j), target in pairs.items():
         np.testing.assert_allclose(target, np.minimum(pairs[i, i], pairs[j, j]), rtol=1e-5, atol=1e-6)
     assert not np.array_equal(pairs[0, 0], pairs[1, 1])
@@ -543,11 +515,11 @@ HUGE = 1e12  # finite, and too large to be true
 
 
 def with_huge_values(state):
-    """The same state with critics that say so everywhere."""
-    *_, last = sorted(state.critic["params"])
-    layer = state.critic["params"][last]
-    layer = layer | {"bias": layer["bias"] + HUGE}
-    return state._replace(critic={"params": state.critic["params"] | {last: layer}})
+    """The same state with critics of this value everywhere."""
+    params = learner(state).critic["params"]
+    *_, last = sorted(params)
+    layer = params[last] | {"bias": params[last]["bias"] + HUGE}
+    return with_learner(state, critic={"params": params | {last: layer}})
 
 
 FAULTS = {
@@ -561,19 +533,18 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_diverged_agent_stays_as_it_was_for_good(algo, fault):
     def parts(state, *without):
-        return state._replace(**dict.fromkeys(("gradient_steps", "diverged", *without)))
+        return with_learner(state, **dict.fromkeys(("diverged", *without)))
 
     update, batch = subject(algo).update, make_batch(1)
     good = run(algo, start(algo), 3)[0][-1]
     state, bad = FAULTS[fault](good, batch)
-    after, td_error, _ = update(state, bad, KEY)
+    after, td_error, _ = update(state, bad, KEY, 3)
     assert after.diverged and not state.diverged
     assert not np.any(td_error)
     # TD7's encoder makes its step before the critics', which fail.
-    encoder = [name for name in ("encoder", "encoder_opt") if hasattr(state, name)]
+    encoder = [name for name in ("encoder", "encoder_opt") if hasattr(learner(state), name)]
     assert same(parts(after, *encoder), parts(state, *encoder))
     assert all(np.isfinite(leaf).all() for leaf in numbers(after))
     # What comes later, however good, changes nothing.
-    later = update(update(after, batch, KEY)[0], batch, KEY)[0]
+    later = update(update(after, batch, KEY, 4)[0], batch, KEY, 5)[0]
     assert later.diverged and same(parts(later), parts(after))
-    assert later.gradient_steps == good.gradient_steps + 3

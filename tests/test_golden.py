@@ -54,7 +54,12 @@ def build(arrays: dict, name: str, **changes):
     algo = name.removeprefix("released_").removesuffix("_plain")
     row = ALGORITHMS[algo]
     preset = preset_settings("released", algo, "ant") if name.startswith("released_") else {}
-    settings = dict(row.settings) | {key: preset[key] for key in settings_of(AgentConfig).keys() & preset.keys()} | meta | changes
+    settings = (
+        dict(row.settings)
+        | {key: preset[key] for key in settings_of(AgentConfig).keys() & preset.keys()}
+        | meta
+        | changes
+    )
     kernels = [nets["critic"][layer]["kernel"] for layer in sorted(nets["critic"])]
     settings["ensemble_size"] = kernels[0].shape[0]
     if "encoder" in nets:

@@ -278,7 +278,7 @@ def test_shapes_that_would_broadcast_to_something_else_are_refused(maybe_jit, sh
 
 @pytest.mark.parametrize("size", [0, 3])
 def test_a_subset_of_more_critics_than_there_are_is_refused(size):
-    with pytest.raises(ValueError, match=f"expects 1 to 2 of the critics, not {size}"):
+    with pytest.raises(ValueError, match=f"expected a subset of 1 to 2 critics, not {size}"):
         q_targets.random_subset(jax.random.key(0), 2, size)
 
 
@@ -301,3 +301,9 @@ def test_the_whole_target_compiles_to_a_handful_of_fused_kernels_without_copies(
     assert not re.search(r"\bcopy(-start)?\(", text)
     if jax.default_backend() == "cpu":
         assert set(kernels) <= {"fusion", "reduce"}, operations
+
+
+@pytest.mark.parametrize(("reduce", "expected"), [("mean", [2, 3.5]), ("min", [1, 2]), ("first", [3, 2])])
+def test_what_the_actor_maximises(maybe_jit, reduce, expected):
+    q = jnp.array([[3.0, 2.0], [1.0, 5.0]])
+    np.testing.assert_allclose(maybe_jit(lambda q: q_targets.ACTOR_REDUCTIONS[reduce](q))(q), expected)

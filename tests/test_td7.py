@@ -31,17 +31,27 @@ CONFIG = AgentConfig(
     assessment_episodes=3,
     exploration_noise=0.0,
 )
-AGENT = td7.make(CONFIG, O, A)
-NO_NOISE = td3.TD3Noise(jnp.zeros((B, A)), jnp.arange(N))
+PARTS = td7.build(CONFIG, O, A)
+AGENT = PARTS.agent
+VIEWS = AGENT.views
+NO_NOISE = td3.TD3Draws(jnp.zeros((B, A)), jnp.arange(N))
 ENCODER, ACTOR, CRITICS = sale.encoder(Z, (8, 7)), sale.sale_actor(A, (8, 7)), sale.sale_critics(N, (8, 7))
 
-update = jax.jit(AGENT.update_with_noise)
-td_target = jax.jit(AGENT.td_target)
+LEARNER = td7.build_learner(CONFIG, O, A, td7.deterministic(CONFIG))
+
+update = jax.jit(PARTS.update)
+update_learner = jax.jit(LEARNER.update)
+td_target = jax.jit(LEARNER.td_target)
 
 
 @cache
-def init(seed=0):
+def checkpointed(seed=0):
     return jax.jit(AGENT.init)(jax.random.key(seed))
+
+
+def init(seed=0):
+    """The learner's first state."""
+    return checkpointed(seed).learner
 
 
 def make_batch(seed) -> Transition:
@@ -53,10 +63,10 @@ def make_batch(seed) -> Transition:
 
 
 def run(state, steps):
-    """The states after each of a few updates, the first one before them."""
-    states = [state]
+    """The states after each of a few updates, of the learner or of all, and before them `state`."""
+    states, function = [state], update if hasattr(state, "learner") else update_learner
     for k in range(steps):
-        states.append(update(states[-1], make_batch(k), NO_NOISE)[0])
+        states.append(function(states[-1], make_batch(k), NO_NOISE, k)[0])
     return states
 
 
@@ -72,13 +82,13 @@ def open_bounds(state, low=-1e8, high=1e8):
 
 
 def test_everything_starts_as_the_learner():
-    state = init()
+    state, checkpoints = init(), checkpointed().checkpoints
     assert same(state.target_actor, state.actor) and same(state.target_critic, state.critic)
     assert same(state.fixed_encoder, state.encoder) and same(state.fixed_encoder_target, state.encoder)
-    assert same(state.checkpoints.snapshot, td7.Policy(state.actor, state.encoder))
-    assert same(state.checkpoints.checkpoint, state.checkpoints.snapshot)
+    assert same(checkpoints.snapshot, td7.Policy(state.actor, state.encoder))
+    assert same(checkpoints.checkpoint, checkpoints.snapshot)
     assert same(state.value_bounds, td7.ValueBounds(1e8, -1e8, 0.0, 0.0))
-    assert same(state.checkpoints[2:], (-1e8, 1e8, 0, 0, 0))
+    assert same(checkpoints[2:], (-1e8, 1e8, 0, 0, 0))
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves((state.actor_opt, state.critic_opt, state.encoder_opt)))
 
 
@@ -108,7 +118,7 @@ def test_the_running_bounds_are_those_of_all_targets_and_come_into_use_at_copies
     state, lowest, highest, in_use = init(), 1e8, -1e8, (0.0, 0.0)
     for k in range(1, 2 * PERIOD + 1):
         target, _ = td_target(state, make_batch(k), NO_NOISE)
-        state, _, _ = update(state, make_batch(k), NO_NOISE)
+        state, _, _ = update_learner(state, make_batch(k), NO_NOISE, k - 1)
         lowest, highest = min(lowest, float(target.min())), max(highest, float(target.max()))
         if k % PERIOD == 0:
             in_use = (lowest, highest)
@@ -161,7 +171,7 @@ def test_the_actor_climbs_the_mean_of_the_critics_that_the_update_has_made():
     """Adam's first step has the sign of the gradient; a large rate tells the new critics from the old ones."""
     batch, before = make_batch(0), open_bounds(init())
     before = before._replace(scalars=before.scalars._replace(lr=jnp.float32(0.3)), fixed_encoder=init(1).encoder)
-    after, _, _ = update(before, batch, NO_NOISE)
+    after, _, _ = update_learner(before, batch, NO_NOISE, 0)
 
     @jax.jit
     @jax.grad
@@ -184,7 +194,7 @@ def test_the_actor_climbs_the_mean_of_the_critics_that_the_update_has_made():
 def test_the_encoder_learns_to_predict_the_next_embedding_which_does_not_move_to_meet_it():
     """Again by the sign of Adam's first step."""
     batch, before = make_batch(0), init()
-    after, _, metrics = update(before, batch, NO_NOISE)
+    after, _, metrics = update_learner(before, batch, NO_NOISE, 0)
     target = ENCODER.zs(before.encoder, batch.next_obs)
 
     @jax.jit
@@ -201,12 +211,33 @@ def test_the_encoder_learns_to_predict_the_next_embedding_which_does_not_move_to
         np.testing.assert_array_equal(np.sign((new - old)[clear]), -np.sign(slope[clear]))
 
 
+# Losses
+
+Q = jnp.array([[1.0, 2.0], [3.0, 5.0]])
+
+
+def test_lap_huber_is_quadratic_below_the_minimum_priority_and_linear_above(maybe_jit):
+    target = jnp.array([0.5, 2.0])  # errors 0.5 and 0; 2.5 and 3
+    loss = maybe_jit(lambda q, target: td7.lap_huber(q, target, 1.0))(Q, target)
+    assert loss.shape == ()
+    np.testing.assert_allclose(loss, (0.125 + 0) / 2 + (2.5 + 3) / 2)  # summed over critics, averaged over the batch
+    np.testing.assert_allclose(td7.lap_huber(Q, target, 2.75), (0.125 + 0) / 2 + (3.125 + 2.75 * 3) / 2)
+
+
+def test_lap_hubers_slope_is_bounded():
+    grad = jax.grad(lambda q: td7.lap_huber(q, jnp.array([0.5, 2.0]), 1.0))(Q)
+    np.testing.assert_allclose(grad, [[0.25, 0], [0.5, 0.5]])  # the error up to 1, per row of the batch
+    below = jax.grad(lambda q: td7.lap_huber(q, jnp.array([10.0, -10.0]), 1.0))(Q)
+    np.testing.assert_allclose(below, [[-0.5, 0.5], [-0.5, 0.5]])
+
+
 # Policy checkpoints
 
 
 @pytest.mark.parametrize(("best", "reset"), [(100.0, 90.0), (-100.0, -90.0)])
 def test_the_best_is_lowered_once_at_the_switch(best, reset):
-    state = init()._replace(checkpoints=init().checkpoints._replace(best_min_return=jnp.float32(best)))
+    checkpoints = checkpointed().checkpoints._replace(best_min_return=jnp.float32(best))
+    state = checkpointed()._replace(checkpoints=checkpoints)
     seen = [float(state.checkpoints.best_min_return) for state in run(state, SWITCH + 3)]
     np.testing.assert_allclose(seen, [best] * SWITCH + [reset] * 4, rtol=1e-6)
 
@@ -215,12 +246,11 @@ def test_the_best_is_lowered_once_at_the_switch(best, reset):
 def three_policies():
     """A state whose learner, snapshot and checkpoint differ, and so do its three encoders."""
     first, second, third = init(0), init(1), init(2)
-    checkpoints = first.checkpoints._replace(
+    checkpoints = checkpointed().checkpoints._replace(
         snapshot=td7.Policy(second.actor, second.encoder), checkpoint=td7.Policy(third.actor, third.encoder)
     )
-    return open_bounds(
-        first._replace(checkpoints=checkpoints, encoder=third.encoder, fixed_encoder_target=second.encoder)
-    )
+    learner = open_bounds(first._replace(encoder=third.encoder, fixed_encoder_target=second.encoder))
+    return checkpointed()._replace(learner=learner, checkpoints=checkpoints)
 
 
 def by_hand(policy, obs):
@@ -233,14 +263,14 @@ def test_the_snapshot_behaves_and_the_checkpoint_is_evaluated(three_policies):
     np.testing.assert_allclose(behaviour, by_hand(state.checkpoints.snapshot, obs), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(evaluation, by_hand(state.checkpoints.checkpoint, obs), rtol=1e-5, atol=1e-6)
     assert not np.any(np.isclose(behaviour, evaluation, rtol=1e-3))
-    assert same(AGENT.policy(state), state.checkpoints.checkpoint)
-    np.testing.assert_array_equal(AGENT.policy_action(AGENT.policy(state), obs), evaluation)
+    assert same(VIEWS.policy(state), state.checkpoints.checkpoint)
+    np.testing.assert_array_equal(VIEWS.policy_action(VIEWS.policy(state), obs), evaluation)
 
 
 def test_the_exploration_noise_is_added_to_the_snapshots_action():
-    agent = td7.make(AgentConfig(hidden=(8, 7), embedding_size=Z), O, A)
-    obs = jnp.zeros((4096, O))
-    noise = agent.act(init(), obs, KEY) - by_hand(init().checkpoints.snapshot, obs)
+    agent = td7.build(AgentConfig(hidden=(8, 7), embedding_size=Z), O, A).agent
+    obs, state = jnp.zeros((4096, O)), checkpointed()
+    noise = agent.act(state, obs, KEY) - by_hand(state.checkpoints.snapshot, obs)
     assert abs(float(noise.mean())) < 0.005 and abs(float(noise.std()) - 0.1) < 0.005
 
 
@@ -248,38 +278,40 @@ def test_learning_leaves_snapshot_and_checkpoint_alone(three_policies):
     before, after = three_policies, run(three_policies, PERIOD + 1)[-1]
     assert same(after.checkpoints.snapshot, before.checkpoints.snapshot)
     assert same(after.checkpoints.checkpoint, before.checkpoints.checkpoint)
+    before, after = before.learner, after.learner
     assert not same(after.actor, before.actor) and not same(after.fixed_encoder, before.fixed_encoder)
 
 
 def test_an_episodes_end_refreshes_the_snapshot_from_actor_and_fixed_encoder(three_policies):
     before = three_policies
-    running = AGENT.observe(before, jnp.array([5.0]), jnp.array([False]))
+    running = AGENT.observe(before, jnp.array([5.0]), jnp.array([False]), 0)
     assert same(running, before)
-    after = AGENT.observe(before, jnp.array([5.0]), jnp.array([True]))
-    assert same(after.checkpoints.snapshot, td7.Policy(before.actor, before.fixed_encoder))
+    after = AGENT.observe(before, jnp.array([5.0]), jnp.array([True]), 0)
+    assert same(after.checkpoints.snapshot, td7.Policy(before.learner.actor, before.learner.fixed_encoder))
     assert same(after.checkpoints.checkpoint, before.checkpoints.snapshot)
     assert same(after._replace(checkpoints=None), before._replace(checkpoints=None))
 
 
 def test_past_the_switch_of_gradient_steps_one_episode_does_not_end_an_assessment(three_policies):
-    late = three_policies._replace(gradient_steps=jnp.int32(SWITCH))
-    after = AGENT.observe(late, jnp.array([5.0]), jnp.array([True])).checkpoints
+    late = three_policies
+    after = AGENT.observe(late, jnp.array([5.0]), jnp.array([True]), SWITCH).checkpoints
     assert after.episodes == 1 and after.assessments == 0
     assert same(after.snapshot, late.checkpoints.snapshot)
     for _ in range(CONFIG.assessment_episodes):
-        late = AGENT.observe(late, jnp.array([5.0]), jnp.array([True]))
+        late = AGENT.observe(late, jnp.array([5.0]), jnp.array([True]), SWITCH)
     assert late.checkpoints.assessments == 1
 
 
 def test_episodes_of_several_environments_are_refused(three_policies):
     with pytest.raises(ValueError, match=r"td7 expects one environment: .* not \(2,\)"):
-        AGENT.observe(three_policies, jnp.array([5.0, 6.0]), jnp.array([True, False]))
+        AGENT.observe(three_policies, jnp.array([5.0, 6.0]), jnp.array([True, False]), 0)
 
 
-def test_the_status_tells_of_checkpoints_and_bounds(three_policies):
-    status = AGENT.status(three_policies)
+def test_the_status_has_policy_checkpoints_and_bounds(three_policies):
+    status = VIEWS.status(three_policies)
     assert status["assessments"] == status["checkpoint_refreshes"] == 0 and np.isnan(status["best_min_return"])
-    status = AGENT.status(AGENT.observe(open_bounds(init(), -3.0, 4.0), jnp.array([5.0]), jnp.array([True])))
+    state = checkpointed()._replace(learner=open_bounds(init(), -3.0, 4.0))
+    status = VIEWS.status(AGENT.observe(state, jnp.array([5.0]), jnp.array([True]), 0))
     named = ("assessments", "checkpoint_refreshes", "best_min_return", "value_low", "value_high")
     assert [float(status[name]) for name in named] == [1, 1, 5, -3, 4]
 
@@ -372,11 +404,11 @@ def test_each_training_episode_is_assessed_by_the_rule(trained):
 def test_evaluation_plays_the_checkpoint(trained):
     obs = jnp.array([[0.3, -0.2]])
     state = trained.states[-1]
-    act = jax.jit(jax.vmap(lambda policy: trained.agent.policy_action(policy, obs)[0, 0]))
+    act = jax.jit(jax.vmap(lambda policy: trained.agent.views.policy_action(policy, obs)[0, 0]))
     worth = np.asarray(act(state.checkpoints.checkpoint))
     returns = np.asarray(trained.sweep.evaluate(trained.final)[0].returns)
     np.testing.assert_allclose(returns, EPISODE * worth[:, None].repeat(2, axis=1), rtol=1e-5, atol=1e-6)
-    learner = td7.Policy(state.actor, state.fixed_encoder)
+    learner = td7.Policy(state.learner.actor, state.learner.fixed_encoder)
     for other in (state.checkpoints.snapshot, learner):
         assert not np.all(np.isclose(act(other), worth, atol=1e-5))
 
@@ -392,13 +424,13 @@ def test_the_replay_learns_its_priorities(trained):
 def test_training_refreshes_the_largest_priority_with_the_copies_of_the_targets(trained):
     """One that no row has any more: rows that got it are drawn at once, and learn their own."""
     state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(trained.final)  # training donates its state
-    steps = int(state.agent.gradient_steps)
+    steps = int(state.gradient_steps)
     assert steps % 4 == 0
     state = state._replace(replay=state.replay._replace(max_priority=jnp.full(MEMBERS, 1000.0)))
     state = trained.sweep.advance(state, 3, True)
     assert np.all(state.replay.max_priority == 1000)
     state = trained.sweep.advance(state, 5, True)
-    assert int(state.agent.gradient_steps) == steps + 8
+    assert int(state.gradient_steps) == steps + 8
     assert np.all(state.replay.max_priority < 10)
 
 

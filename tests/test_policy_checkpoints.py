@@ -1,11 +1,11 @@
-"""TD7's policy checkpoints by hand: what an episode's end does to snapshot, checkpoint and counters."""
+"""TD7's policy checkpoints by hand: what the end of an episode does to snapshot, checkpoint and counters."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sqt_jax.agents import assessment
+from sqt_jax.agents import policy_checkpoints
 from sqt_jax.agents.td7 import Policy
 from sqt_jax.config import AgentConfig
 
@@ -22,7 +22,7 @@ def labelled(label):
 
 
 def assess(state, learner, gradient_steps, episode_return, ended=True):
-    return jax.jit(assessment.assess, static_argnums=0)(
+    return jax.jit(policy_checkpoints.assess, static_argnums=0)(
         CONFIG, state, labelled(learner), jnp.int32(gradient_steps), jnp.float32(episode_return), jnp.asarray(ended)
     )
 
@@ -38,7 +38,7 @@ def story(state, *episodes, gradient_steps=0, learners=range(1, 100)):
     return state, rows
 
 
-START = assessment.Checkpoints(labelled(0), labelled(0), *map(jnp.float32, (-1e8, 1e8, 0, 0, 0)))
+START = policy_checkpoints.PolicyCheckpoints(labelled(0), labelled(0), *map(jnp.float32, (-1e8, 1e8, 0, 0, 0)))
 
 
 def test_before_the_switch_each_episode_is_an_assessment():
@@ -88,11 +88,11 @@ def test_a_running_episode_changes_nothing(episode_return):
 
 
 def test_at_the_start_the_policy_is_all_there_is():
-    assert same(assessment.start(labelled(0)), START)
+    assert same(policy_checkpoints.start(labelled(0)), START)
 
 
 @pytest.mark.parametrize(("best", "reset"), [(100.0, 90.0), (-100.0, -90.0)])
 def test_the_best_is_lowered_at_the_switch_alone(best, reset):
     state = START._replace(best_min_return=jnp.float32(best))
-    lowered = [assessment.lower_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
+    lowered = [policy_checkpoints.lower_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
     np.testing.assert_allclose([float(state.best_min_return) for state in lowered], [best, reset, best], rtol=1e-6)
