@@ -26,7 +26,7 @@ def one_step() -> Environment:
 
 def shorter_than_it_says() -> Environment:
     """`one_step`, whose replay has room for the final observations of longer episodes."""
-    return one_step()._replace(shortest_episode=8)
+    return one_step()._replace(min_mean_episode_length=8)
 
 
 @functools.cache  # the same environment is the same object, so that its runs can share their programs

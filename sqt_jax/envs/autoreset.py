@@ -51,7 +51,7 @@ def make_environment(
     start: Start,
     advance: Advance,
     place: Place | None = None,
-    shortest_episode: int = 1,
+    min_mean_episode_length: int = 1,
 ) -> Environment:
     """Make an `Environment` out of a task that knows nothing of episodes.
 
@@ -61,7 +61,7 @@ def make_environment(
       advance: `(state, action [A] in [-1, 1]) -> (state, obs [O], reward [], terminated [] bool)`, one step.
       place: `(qpos, qvel) -> (state, obs [O])`, a given physical state; gives `Environment.set_physics`, whose
         episodes to come start from a fixed key.
-      shortest_episode: as in `Environment`.
+      min_mean_episode_length: as in `Environment`.
     """
 
     def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
@@ -109,5 +109,5 @@ def make_environment(
 
     given = set_physics if place else None
     return Environment(
-        name, observation_size, action_size, episode_length, reset, step, given, status, shortest_episode
+        name, observation_size, action_size, episode_length, reset, step, given, status, min_mean_episode_length
     )

@@ -62,7 +62,7 @@ def make_brax(name: str, physics: str) -> Environment:
 
     shortest = SHORTEST_FALL if name in FALLING else 1 if name in PENDULUMS else EPISODE_LENGTH
     sizes = env.observation_size, env.action_size, EPISODE_LENGTH
-    return make_environment(name, *sizes, start, advance, shortest_episode=shortest)
+    return make_environment(name, *sizes, start, advance, min_mean_episode_length=shortest)
 
 
 def brax_own(name: str, physics: str) -> Any:
