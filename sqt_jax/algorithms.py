@@ -198,7 +198,9 @@ def agent_of(config: Config, env: Environment) -> Agent:
 def replay_of(config: Config, env: Environment) -> Replay:
     """The replay buffer of an experiment, for an environment's sizes."""
     agent, settings = config.agent, config.train
-    rows = Ring(settings.capacity, env.observation_size, env.action_size, settings.num_envs, env.shortest_episode)
+    rows = Ring(
+        settings.capacity, env.observation_size, env.action_size, settings.num_envs, env.min_mean_episode_length
+    )
     if not ALGORITHMS[config.algo].assessed:
         return replay.uniform(rows, settings.batch_size)
     return lap.lap(rows, settings.batch_size, agent.priority_exponent, agent.min_priority, agent.target_update_period)

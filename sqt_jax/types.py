@@ -61,7 +61,9 @@ class Environment(NamedTuple):
     step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
     set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
     status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts worth reporting, summed over environments
-    shortest_episode: int = 1  # steps that episodes take at least, in the mean: the replay has room for such (`Ring`)
+    # Memory hint: a lower bound on the mean episode length, in steps. 1 is always safe; larger values let the replay
+    # allocate less (`Ring`).
+    min_mean_episode_length: int = 1
 
 
 class Agent(NamedTuple):

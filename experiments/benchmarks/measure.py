@@ -300,7 +300,7 @@ def replay_case(kind: str, what: str, task: str, capacity: int, members: int) ->
 def replay_steps(kind: str, what: str, task: str, capacity: int, members: int) -> Callable[[int], Any]:
     """A number of inserts or samples -> what it waits for."""
     env = envs.make(task)
-    ring = Ring(capacity, env.observation_size, env.action_size, shortest_episode=env.shortest_episode)
+    ring = Ring(capacity, env.observation_size, env.action_size, min_mean_episode_length=env.min_mean_episode_length)
     store = REPLAYS[kind](ring, BATCH)
     axes = member_axes(jax.eval_shape(store.init))
     obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)
