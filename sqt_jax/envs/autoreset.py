@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sqt_jax.conditional import rarely
+from sqt_jax.conditional import cond_if_any
 from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
 
 LARGEST = 1e10  # MuJoCo's own limit (mjMAXVAL): beyond it, a simulation has diverged
@@ -97,7 +97,7 @@ def make_environment(
         truncated = steps >= episode_length
 
         ended = terminated | truncated
-        state, obs = rarely(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
+        state, obs = cond_if_any(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
         return TimeStep(state, obs, reward, terminated, truncated, final_obs)
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:
