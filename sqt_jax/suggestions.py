@@ -1,16 +1,16 @@
-"""What is said of a name that a table does not have."""
+"""Messages for an unknown name: the known names, and "did you mean ...?"."""
 
 import difflib
 from collections.abc import Iterable
 
 
-def nearest(name: object, known: Iterable[str]) -> str:
-    """'; did you mean X?' where a known name is similar, else nothing."""
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """ "; did you mean X?" if a known name is similar, else "": to be appended to a message."""
     match = difflib.get_close_matches(str(name), list(known), n=1)
     return f"; did you mean {match[0]}?" if match else ""
 
 
-def unknown(name: object, known: Iterable[str]) -> str:
-    """All the known names, and the nearest one."""
+def expected_one_of(name: object, known: Iterable[str]) -> str:
+    """ "expected one of A, B, C, got 'D'", and `did_you_mean`."""
     known = list(known)
-    return f"expects one of {', '.join(known)}, not {name!r}{nearest(name, known)}"
+    return f"expected one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}"

@@ -12,7 +12,7 @@ import pytest
 from experiments.gymnasium_parity.gymnasium_reference import gymnasium_environment
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
-from sqt_jax.envs.autoreset import SHORTEST_FALL
+from sqt_jax.envs.autoreset import MIN_STEPS_TO_FALL
 from sqt_jax.envs.physics import PHYSICS, Physics, PhysicsState
 
 
@@ -181,7 +181,7 @@ def test_a_tasks_options_reach_its_physics_and_give_way_to_the_callers(monkeypat
 
 @pytest.fixture
 def recording_physics(monkeypatch):
-    """A simulator in which nothing moves and the state keeps the last control."""
+    """Physics in which nothing moves and the state keeps the last control."""
 
     def make(setup):
         shapes = {"cinert": setup.model.nbody * 10, "cvel": setup.model.nbody * 6, "qfrc_actuator": setup.model.nv}
@@ -221,5 +221,26 @@ def test_no_constant_action_at_its_limits_makes_a_robot_fall_sooner_than_the_rep
             steps += next((step for step in range(1, 31) if env.step(action)[2]), 30)
         lengths[tuple(corner)] = steps / 3
     shortest = min(lengths.values())
-    assert shortest >= SHORTEST_FALL
+    assert shortest >= MIN_STEPS_TO_FALL
     assert name not in ("hopper", "walker") or shortest < 7  # it is a tight one
+
+
+@pytest.mark.parametrize("name", ["cheetah", "walker", "ant", "hopper", "swimmer"])
+def test_speed_is_gymnasiums_x_velocity(name):
+    theirs, ours = gymnasium_environment(name), envs.make(name, "mujoco")
+    theirs.reset(seed=0)
+    timestep = jax.jit(ours.set_physics)(theirs.data.qpos, theirs.data.qvel)
+    assert ours.speed(timestep) == 0
+    step, generator = jax.jit(ours.step), np.random.default_rng(0)
+    low, high = theirs.model.actuator_ctrlrange.T
+    for _ in range(3):
+        action = generator.uniform(-1, 1, theirs.model.nu)
+        x_velocity = theirs.step((low + high) / 2 + action * (high - low) / 2)[4]["x_velocity"]
+        timestep = step(timestep, jnp.float32(action))
+        assert not timestep.terminated and abs(x_velocity) > 1e-3
+        np.testing.assert_allclose(ours.speed(timestep), x_velocity, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["humanoid_standup", "humanoid_standup-v5"])
+def test_standing_up_has_no_speed(name):
+    assert envs.make(name, "mujoco").speed is None

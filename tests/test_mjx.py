@@ -1,4 +1,4 @@
-"""The MJX simulator; its agreement with MuJoCo C over whole tasks is in test_gymnasium_parity."""
+"""The physics `mjx`; its agreement with MuJoCo C over whole tasks is in test_gymnasium_parity."""
 
 from importlib.metadata import version
 
@@ -100,7 +100,7 @@ def test_models_own_solver_settings_are_reachable_and_give_the_same_step():
 
 @pytest.mark.parametrize("name", ["iterations", "ls_iterations"])
 def test_a_solver_without_steps_is_refused(name):
-    with pytest.raises(ValueError, match=f"{name}: expects a whole number of at least 1, .* not 0"):
+    with pytest.raises(ValueError, match=f"{name}: expected a whole number of at least 1, .* got 0"):
         envs.make("ant", **{name: 0})
 
 
