@@ -23,8 +23,8 @@ from sqt_jax.config import (
     check_agent,
     check_train,
 )
-from sqt_jax.names import nearest, unknown
 from sqt_jax.ring import Ring
+from sqt_jax.suggestions import did_you_mean, expected_one_of
 from sqt_jax.types import Agent, Environment, Replay
 
 
@@ -99,7 +99,7 @@ TRAIN_SETTINGS = frozenset(field.name for field in dataclasses.fields(TrainConfi
 def _refuse_unknown(settings: Iterable[str], known: Iterable[str]) -> None:
     for name in settings:
         if name not in known:
-            raise ConfigError(name, f"is not a setting{nearest(name, known)}")
+            raise ConfigError(name, f"is not a setting{did_you_mean(name, known)}")
 
 
 def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
@@ -109,7 +109,7 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
       ConfigError: for an unknown name or a value that cannot be; the message names the setting and what it expects.
     """
     if algo not in ALGORITHMS:
-        raise ConfigError("algo", unknown(algo, ALGORITHMS))
+        raise ConfigError("algo", expected_one_of(algo, ALGORITHMS))
     _refuse_unknown(settings, AGENT_SETTINGS)
     if isinstance(settings.get("hidden"), list):  # out of a JSON file
         settings["hidden"] = tuple(settings["hidden"])
@@ -149,12 +149,12 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
         env = envs.resolve(env)
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
-    known = envs.simulators(env)
+    known = envs.physics_of(env)
     physics = physics or known[0]
     if physics not in known:
-        raise ConfigError("physics", f"{unknown(physics, known)} for {env}")
+        raise ConfigError("physics", f"{expected_one_of(physics, known)} for {env}")
     if eval_physics not in ("auto", *known):
-        raise ConfigError("eval_physics", f"{unknown(eval_physics, ['auto', *known])} for {env}")
+        raise ConfigError("eval_physics", f"{expected_one_of(eval_physics, ['auto', *known])} for {env}")
     train_config = TrainConfig(**{**ALGORITHMS[algo].training, **training})
     check_train(train_config)
     if ALGORITHMS[algo].assessed and train_config.num_envs > 1:
@@ -169,7 +169,7 @@ def check_physics(config: Config) -> None:
     """
     for setting, physics in {"physics": config.physics, "eval_physics": eval_physics_of(config)}.items():
         if missing := envs.lacks(physics):
-            here = ", ".join(name for name in envs.simulators(config.env) if not envs.lacks(name))
+            here = ", ".join(name for name in envs.physics_of(config.env) if not envs.lacks(name))
             raise ConfigError(setting, f"{physics} needs {missing}; expects one of {here} here")
 
 
@@ -220,7 +220,7 @@ def eval_physics_of(config: Config) -> str:
     """The physics that evaluation plays on: with `auto`, MuJoCo C where it is the faster one."""
     if config.eval_physics != "auto":
         return config.eval_physics
-    faster = jax.default_backend() == "cpu" and "mujoco" in envs.simulators(config.env)
+    faster = jax.default_backend() == "cpu" and "mujoco" in envs.physics_of(config.env)
     return "mujoco" if faster else config.physics
 
 

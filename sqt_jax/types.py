@@ -64,6 +64,9 @@ class Environment(NamedTuple):
     # Memory hint: a lower bound on the mean episode length, in steps. 1 is always safe; larger values let the replay
     # allocate less (`Ring`).
     min_mean_episode_length: int = 1
+    speed: Callable[[TimeStep], Array] | None = (
+        None  # -> [], forward speed in m/s of the step to this time step, if any
+    )
 
 
 class Agent(NamedTuple):

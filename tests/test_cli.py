@@ -279,8 +279,8 @@ def test_help_lists_every_group(capsys):
 BAD = [
     ("--stepz=5", "--stepz: unknown flag; did you mean --steps?"),
     ("--steps=two\nlines", "--steps=two\\nlines: expects a whole number"),
-    ("--algo=sac_sqtt", "--algo: expects one of td3, td3_sqt, td3_sqt_tuple, sac, sac_sqt, sac_sqt_tuple, "),
-    ("--env=antt", "--env: expects one of cheetah, walker, ant, humanoid"),
+    ("--algo=sac_sqtt", "--algo: expected one of td3, td3_sqt, td3_sqt_tuple, sac, sac_sqt, sac_sqt_tuple, "),
+    ("--env=antt", "--env: expected one of cheetah, walker, ant, humanoid"),
     ("--algo=sac --penalty_coef=0.5", "--penalty_coef: expects 0 for sac"),
     ("--algo=td3_sqt --temperature=0.1,0.2", "--temperature: has no effect with td3_sqt"),
     (
@@ -317,7 +317,7 @@ def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, l
 def test_unknown_physics_is_refused(tmp_path, capsys):
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--physics=warp9"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("--physics: expects one of mjx, mujoco, warp, not 'warp9'") and err.count("\n") == 1
+    assert err.startswith("--physics: expected one of mjx, mujoco, warp, got 'warp9'") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("flag", ["physics", "eval_physics"])

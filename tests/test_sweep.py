@@ -157,8 +157,8 @@ def test_a_diverged_member_does_not(tmp_path):
     ("arguments", "line"),
     [
         ("", "--preset: expects one of table2, table3, table4, all, alpha\n"),
-        ("--preset=table2 --algos=td4", "--algos: expects one of td3, "),
-        ("--preset=table2 --tasks=antt", "--tasks: expects one of cheetah, "),
+        ("--preset=table2 --algos=td4", "--algos: expected one of td3, "),
+        ("--preset=table2 --tasks=antt", "--tasks: expected one of cheetah, "),
         (
             "--preset=table2 --name=x",
             "--name=x: expects flags of experiments.run in the form --flag=value, but for --algo",

@@ -29,9 +29,9 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("--mdps=maze", "--mdps: expects one of random, chain, grid, not 'maze'"),
+        ("--mdps=maze", "--mdps: expected one of random, chain, grid, got 'maze'"),
         ("--mdps=", "--mdps: expects at least one"),
-        ("--algos=q_learning,sarsa", "--algos: expects one of q_learning, "),
+        ("--algos=q_learning,sarsa", "--algos: expected one of q_learning, "),
         ("--coefs=0,-1", "--coefs: expects numbers of at least 0 like 0,0.5, not '-1'"),
         ("--coefs=nan", "--coefs: expects numbers of at least 0"),
         ("--coefs=0,0.0", "--coefs: expects each value once, 0.0 is there 2 times"),
@@ -39,7 +39,7 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
         ("--seeds=many", "--seeds: expects an integer in the range [1, 10000]"),
         ("--steps=1", "--steps: expects an integer in the range [100, 100000000]"),
         ("--tables=1", "--tables: expects an integer in the range [2, 100]"),
-        ("--greedy=max", "--greedy: expects one of min, mean, penalised, not 'max'"),
+        ("--greedy=max", "--greedy: expected one of min, mean, penalised, got 'max'"),
         ("--gamma=1", "--gamma: expects a number above 0 and below 1, not 1"),
         ("--gamma=0", "--gamma: expects a number above 0 and below 1, not 0"),
         ("--gamma=nan", "--gamma: expects a number"),

@@ -22,8 +22,8 @@ from experiments.benchmarks import kernels, operations
 from experiments.benchmarks.timing import tried_in_turns
 from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.config import Config
-from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
+from sqt_jax.envs.physics.threads import usable_cores
 from sqt_jax.members import Layout, member_axes, usable_devices
 from sqt_jax.ring import Ring
 from sqt_jax.types import Array, Transition
