@@ -31,7 +31,7 @@ def shorter_than_it_says() -> Environment:
 
 @functools.cache  # the same environment is the same object, so that its runs can share their programs
 def constant_reward(episode_length: int = 5) -> Environment:
-    """Reward 1 for ever; episodes end by the time limit alone, so Q = 1 / (1 - gamma) everywhere."""
+    """Reward 1 for ever; only the time limit ends episodes, so Q = 1 / (1 - gamma) everywhere."""
 
     def start(key):
         obs = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)

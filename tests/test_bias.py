@@ -52,7 +52,7 @@ def test_the_mean_and_the_minimum_of_the_critics_have_a_bias_each():
 
 
 def test_bonuses_count_from_the_next_action_on():
-    # With a bonus of 2 per action, Q of the last state is its reward alone, of the one before 1 + 0.5 (2 + 1), ...
+    # With a bonus of 2 per action, Q of the last state is its reward only, of the one before 1 + 0.5 (2 + 1), ...
     truth = jnp.array([1 + 0.5 * (2 + 1 + 0.5 * (2 + 1)), 1 + 0.5 * (2 + 1), 1.0])
     _, found = measure(countdown(3), lambda obs: truth[obs[:, 0].astype(int)][None], 0.5, bonus=2.0)
     np.testing.assert_allclose(found, 0, atol=1e-6)

@@ -54,7 +54,7 @@ def test_reward_by_hand(name, control, expected):
         ("ant-v5", [3.0, -0.5], 5e-4 * (1 + 0.25)),  # each force clipped to 1
         ("humanoid", [3000.0, 0], 0),
         ("humanoid-v5", [3000.0, 0], 5e-7 * 9e6),
-        ("humanoid-v5", [9000.0, 0], 10),  # the whole cost clipped to 10
+        ("humanoid-v5", [9000.0, 0], 10),  # the sum is clipped to 10
         ("humanoid_standup", [3000.0, 0], 5e-7 * 9e6),
         ("humanoid_standup-v5", [-9000.0, 0], 10),
     ],

@@ -1,4 +1,4 @@
-"""MuJoCo C inside compiled programs; that whole episodes are Gymnasium's is in test_gymnasium_parity."""
+"""MuJoCo C inside compiled programs; complete episodes are compared with Gymnasium in test_gymnasium_parity."""
 
 import concurrent.futures
 

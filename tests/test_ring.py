@@ -144,14 +144,14 @@ def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
 
 
 @pytest.mark.parametrize("width", [1, 3, 4])
-def test_other_than_one_transition_per_environment_is_refused(width):
+def test_other_than_one_transition_per_environment_is_rejected(width):
     ring = Ring(CAPACITY, O, A, num_envs=2)
     with pytest.raises(ValueError, match=r"expected transitions of {'obs': \(2, "):
         ring.insert(ring.init(), Stream(width).step(np.zeros(width, bool)))
 
 
 @pytest.mark.parametrize("field", Transition._fields)
-def test_transitions_of_other_sizes_are_refused(field):
+def test_transitions_of_other_sizes_are_rejected(field):
     """A narrower row would be written without complaint, its columns one place too early."""
     ring, one = Ring(CAPACITY, O, A), Stream(1).step(np.zeros(1, bool))
     ring.insert(ring.init(), one)
@@ -161,7 +161,7 @@ def test_transitions_of_other_sizes_are_refused(field):
 
 
 @pytest.mark.parametrize("capacity", [0, 1, 3, 13])
-def test_a_capacity_that_an_insert_could_straddle_is_refused(capacity):
+def test_a_capacity_that_an_insert_could_straddle_is_rejected(capacity):
     with pytest.raises(ValueError, match=f"capacity .{capacity}. must be a multiple of the rows inserted at once .2."):
         Ring(capacity, O, A, num_envs=2).init()
 

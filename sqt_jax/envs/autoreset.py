@@ -65,7 +65,7 @@ def make_environment(
 
     >>> def start(key):
     ...     x = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
-    ...     return x, x  # the state, and what the agent sees of it
+    ...     return x, x  # the state and the observation
     >>> def advance(x, action):
     ...     x = x + 0.1 * action
     ...     return x, x, -jnp.abs(x[0]), jnp.abs(x[0]) > 2.0
