@@ -202,7 +202,7 @@ def test_optional_functions_are_none_if_they_are_not_given():
 
 
 def test_speed_is_that_of_the_step_just_made():
-    """Positions 0, 1, 3, 6, ...: the state is (position, last displacement), a step is 0.5 s."""
+    """Positions 0, 1, 3, 6, 0, ...: the state is (position, last displacement), a step is 0.5 s; the fourth ends."""
 
     def advance(state, action):
         step = state[1] + 1
@@ -211,12 +211,12 @@ def test_speed_is_that_of_the_step_just_made():
     def start(key):
         return jnp.zeros(2), jnp.zeros(1)
 
-    env = make_environment("faster", 1, 1, 10, start, advance, speed=lambda state: state[1] / 0.5)
+    env = make_environment("faster", 1, 1, 4, start, advance, speed=lambda state: state[1] / 0.5)
     timestep, speeds = env.reset(jax.random.key(0)), []
-    for _ in range(3):
+    for _ in range(5):
         timestep = env.step(timestep, jnp.zeros(1))
         speeds.append(float(env.speed(timestep)))
-    assert speeds == [2.0, 4.0, 6.0]
+    assert speeds == [2.0, 4.0, 6.0, 0.0, 2.0]
 
 
 # The same contract on a real task.

@@ -16,7 +16,7 @@ The contract of the environments it makes (one test per sentence in tests/test_a
 - A step whose reward or observation is not finite, or beyond 1e10 (the physics diverged), ends the episode: terminated,
   reward 0, and `final_obs` is the observation before it, so that every output stays finite.
 - `status` counts these steps, over all episodes, as `unstable_steps`.
-- `speed` is that of the step just made.
+- `speed` is that of the step just made; after the end of an episode, that of the new start.
 """
 
 from collections.abc import Callable
@@ -72,8 +72,9 @@ def make_environment(
     >>> env = make_environment("point", 1, 1, 200, start, advance)
 
     `start` and `advance` are JAX code for a single environment, without a batch axis: training calls them under `jit`
-    and `vmap`. They know nothing of episodes: `make_environment` adds the time limit, clips actions to [-1, 1], starts
-    a new episode after each end (the auto-reset) and ends an episode whose numbers are no longer finite.
+    and `vmap`. They know nothing of episodes: `make_environment` adds the time limit, clips actions to [-1, 1] and ends
+    an episode whose numbers are no longer finite. After each end it calls `start` again (the auto-reset): the time step
+    then has the state and `obs` of the new episode, and the old one's last observation as `final_obs`.
 
     What they must not do: have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
     key in the state and split it), branch in Python on a traced value, count the time limit, or start a new episode
