@@ -12,7 +12,7 @@ from sqt_jax.bias import BiasSums
 from sqt_jax.types import Array, Environment, Metrics, Transition
 
 PolicyWithBonus = Callable[[Array, Array], tuple[Array, Array]]  # obs [E, O], key -> action [E, A], entropy bonus [E]
-Critics = Callable[[Array, Array], Array]  # obs [E, O], action [E, A] -> [N, E]
+Critics = Callable[[Array, Array], Array]  # obs [K, O], action [K, A] -> [N, K]
 Extra = TypeVar("Extra")
 
 
