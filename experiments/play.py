@@ -167,8 +167,8 @@ def _task(config: Any, options: argparse.Namespace) -> Task:
 
     brax = config.env.startswith(BRAX)
     physics = options.physics or (config.physics if brax else "mujoco")
-    if physics not in envs.simulators(config.env):
-        raise UsageError(f"--physics={physics}: expects one of {', '.join(envs.simulators(config.env))}")
+    if physics not in envs.physics_of(config.env):
+        raise UsageError(f"--physics={physics}: expects one of {', '.join(envs.physics_of(config.env))}")
     if missing := envs.lacks(physics):
         raise UsageError(f"--physics={physics}: needs {missing}")
     if brax:

@@ -22,7 +22,7 @@ from absl import flags as absl_flags
 
 from experiments.evidence.published import PAPERS_TASKS
 from experiments.running.progress import format_seconds
-from sqt_jax.names import unknown
+from sqt_jax.suggestions import expects_one_of
 
 BASES = ("td3", "sac", "td7")
 DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
@@ -170,10 +170,10 @@ def main(argv: Sequence[str]) -> int:
     if FLAGS.preset is None:
         return refuse(f"--preset: expects one of {', '.join(PRESETS)}")
     if FLAGS.preset not in PRESETS:
-        return refuse(f"--preset: {unknown(str(FLAGS.preset), PRESETS)}")
+        return refuse(f"--preset: {expects_one_of(str(FLAGS.preset), PRESETS)}")
     for algo in FLAGS.algos:
         if algo not in ALGORITHMS:
-            return refuse(f"--algos: {unknown(algo, ALGORITHMS)}")
+            return refuse(f"--algos: {expects_one_of(algo, ALGORITHMS)}")
     try:
         tasks = [envs.resolve(task) for task in FLAGS.tasks]
     except ValueError as error:

@@ -34,7 +34,7 @@ from experiments.running import runtime
 from experiments.running.progress import format_seconds
 from experiments.theorem import claims as report
 from experiments.theorem import contraction, mdps, q_learning, value_figure
-from sqt_jax.names import nearest, unknown
+from sqt_jax.suggestions import did_you_mean, expects_one_of
 
 DONE, BAD_USAGE, INTERRUPTED = 0, 2, 130
 TABLE, FIGURE = "table.md", "tabular.png"
@@ -84,7 +84,7 @@ def parse(argv: Sequence[str]) -> dict[str, Any]:
     try:
         rest = values(list(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
-        hint = nearest(f"--{error.flagname}", [f"--{name}" for name in values]) or "; --help lists the flags"
+        hint = did_you_mean(f"--{error.flagname}", [f"--{name}" for name in values]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
     except absl_flags.Error as error:
         found = re.search(r"-*(\w+)(?==|$)", str(error).removeprefix("flag ").splitlines()[0])
@@ -100,9 +100,9 @@ def parse(argv: Sequence[str]) -> dict[str, Any]:
         _check_list(name, flag[name])
         for word in flag[name]:
             if word not in known:
-                raise UsageError(f"--{name}: {unknown(word, known)}")
+                raise UsageError(f"--{name}: {expects_one_of(word, known)}")
     if flag["greedy"] not in q_learning.GREEDY:
-        raise UsageError(f"--greedy: {unknown(flag['greedy'], q_learning.GREEDY)}")
+        raise UsageError(f"--greedy: {expects_one_of(flag['greedy'], q_learning.GREEDY)}")
     _check_list("coefs", flag["coefs"])
     coefs = [_coefficient(word) for word in flag["coefs"]]
     _check_list("coefs", coefs)

@@ -14,9 +14,9 @@ import jax
 from sqt_jax import envs, lap, replay, train
 from sqt_jax.agents import released, sac, td3, td7
 from sqt_jax.config import SETTINGS, AgentConfig, Config, TrainConfig, check_agent, check_train
-from sqt_jax.names import nearest, unknown
 from sqt_jax.ring import Ring
 from sqt_jax.settings import ConfigError, settings_of
+from sqt_jax.suggestions import did_you_mean, expects_one_of
 from sqt_jax.types import Agent, Environment, Parts, Replay
 
 Build = Callable[[AgentConfig, int, int], Parts]  # (config, observation size, action size) -> the agent
@@ -123,7 +123,7 @@ def make_agent_config(algo: str, training: Mapping[str, Any] = MappingProxyType(
       ConfigError: an unknown name or an invalid value; the message names the setting and what it expects.
     """
     if algo not in ALGORITHMS:
-        raise ConfigError("algo", unknown(algo, ALGORITHMS))
+        raise ConfigError("algo", expects_one_of(algo, ALGORITHMS))
     _reject_unknown(settings, settings_of(AgentConfig))
     if isinstance(settings.get("hidden"), list):  # from a JSON file
         settings["hidden"] = tuple(settings["hidden"])
@@ -187,19 +187,19 @@ def _check_env(env: str | Environment, physics: str | None, eval_physics: str) -
         env = envs.resolve(env)
     except ValueError as error:
         raise ConfigError("env", str(error)) from None
-    known = envs.simulators(env)
+    known = envs.physics_of(env)
     physics = physics or known[0]
     if physics not in known:
-        raise ConfigError("physics", f"{unknown(physics, known)} for {env}")
+        raise ConfigError("physics", f"{expects_one_of(physics, known)} for {env}")
     if eval_physics not in ("auto", *known):
-        raise ConfigError("eval_physics", f"{unknown(eval_physics, ['auto', *known])} for {env}")
+        raise ConfigError("eval_physics", f"{expects_one_of(eval_physics, ['auto', *known])} for {env}")
     return env, physics, eval_physics
 
 
 def _reject_unknown(settings: Iterable[str], known: Iterable[str]) -> None:
     for name in settings:
         if name not in known:
-            raise ConfigError(name, f"is not a setting{nearest(name, known)}")
+            raise ConfigError(name, f"is not a setting{did_you_mean(name, known)}")
 
 
 def check_physics(config: Config) -> None:
@@ -211,7 +211,7 @@ def check_physics(config: Config) -> None:
         return
     for setting, physics in {"physics": config.physics, "eval_physics": eval_physics_of(config)}.items():
         if missing := envs.lacks(physics):
-            here = ", ".join(name for name in envs.simulators(config.env) if not envs.lacks(name))
+            here = ", ".join(name for name in envs.physics_of(config.env) if not envs.lacks(name))
             raise ConfigError(setting, f"{physics} needs {missing}; expects one of {here} here")
 
 
@@ -248,7 +248,9 @@ def agent_of(config: Config, env: Environment) -> Agent:
 def replay_of(config: Config, env: Environment) -> Replay:
     """The replay buffer of an experiment, for an environment's sizes."""
     agent, settings = config.agent, config.train
-    rows = Ring(settings.capacity, env.observation_size, env.action_size, settings.num_envs, env.shortest_episode)
+    rows = Ring(
+        settings.capacity, env.observation_size, env.action_size, settings.num_envs, env.min_mean_episode_length
+    )
     if "checkpoints" not in ALGORITHMS[config.algo].features:
         return replay.uniform(rows, settings.batch_size)
     return lap.lap(rows, settings.batch_size, agent.priority_exponent, agent.min_priority, agent.target_update_period)
@@ -286,7 +288,7 @@ def eval_physics_of(config: Config) -> str:
     """The physics of evaluation; with `auto`, MuJoCo C where it is the faster one."""
     if config.eval_physics != "auto":
         return config.eval_physics
-    faster = jax.default_backend() == "cpu" and "mujoco" in envs.simulators(config.env)
+    faster = jax.default_backend() == "cpu" and "mujoco" in envs.physics_of(config.env)
     return "mujoco" if faster else config.physics
 
 

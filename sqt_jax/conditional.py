@@ -1,10 +1,8 @@
-"""A condition that stays one under `vmap`.
+"""A conditional that is still one under `vmap`.
 
-`jax.lax.cond` on a batched predicate becomes a `select`: both branches run for all. Here the branch runs if the
-predicate holds anywhere in the batch, and where it holds nowhere, nothing is computed and nothing is copied.
-
-Derivatives go forward only (`jax.jvp`): JAX cannot transpose a function with a batching rule of its own. What is
-trained here needs no derivative of an environment's step.
+Under `vmap`, `jax.lax.cond` on a batched predicate becomes a `select` and runs both branches for all. `cond_if_any`
+runs its branch only if the predicate holds for at least one batch entry; if it holds for none, nothing is computed or
+copied.
 """
 
 from collections.abc import Callable
@@ -16,15 +14,27 @@ from jax.custom_batching import custom_vmap
 
 from sqt_jax.types import Array
 
-Branch = Callable[[Any, Any], Any]
+Branch = Callable[[Any, Any], Any]  # (old, given) -> a tree like old
 
 
-def rarely(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) -> Any:
-    """`branch(old, given)` where `predicate` [] holds, else `old`: for what most steps do not need.
+def cond_if_any(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) -> Any:
+    """`branch(old, given)` if `predicate` holds, else `old`; under `vmap` the branch runs only if any entry needs it.
+
+    Under `vmap`, `lax.cond` on a batched predicate becomes a select and runs both branches for all; this runs the
+    branch only if the predicate holds for at least one batch entry. Entries for which it does not hold keep `old`. Use
+    it for updates that are rare and expensive, like the start of a new episode.
+
+    Only forward derivatives (`jax.jvp`) are supported: JAX cannot transpose a function with a custom batching rule.
 
     Args:
-      branch: closes over no traced values, which `vmap` could not see; all it needs is in `old` and `given`. It gives
-        a tree like `old`.
+      predicate: [] bool.
+      branch: `(old, given) -> new`, a tree with the structure, shapes and types of `old`. It must not close over traced
+        values, because `vmap` does not see those: pass them in `given`.
+      old: a tree of arrays, returned where `predicate` is false.
+      given: a tree of further arrays for the branch.
+
+    Returns:
+      A tree like `old`.
     """
 
     def select(predicate: Array, old: Any, given: Any) -> Any:
@@ -34,7 +44,7 @@ def rarely(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) -> An
 
 
 def _if_any(select: Callable) -> Callable:
-    """`select(predicate, old, given)` if `predicate`, an array of any shape, holds anywhere; else `old`."""
+    """`select(predicate, old, given)` if any entry of `predicate`, an array of any shape, holds; else `old`."""
 
     @custom_vmap
     def call(predicate: Array, old: Any, given: Any) -> Any:
@@ -42,10 +52,10 @@ def _if_any(select: Callable) -> Callable:
 
     @call.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:
-        def everywhere(x: Array, batched: bool) -> Array:
+        def batch(x: Array, batched: bool) -> Array:
             return x if batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
 
-        predicate, old, given = jax.tree.map(everywhere, args, tuple(in_batched))
+        predicate, old, given = jax.tree.map(batch, args, tuple(in_batched))
         return _if_any(jax.vmap(select))(predicate, old, given), jax.tree.map(lambda _: True, old)
 
     return call

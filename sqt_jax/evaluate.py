@@ -1,4 +1,4 @@
-"""Episodes of a fixed policy from fresh starts: what it reaches, and what its critics say of that."""
+"""Evaluation: episodes of a fixed policy from fresh starts, and the bias of its critics along them."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -8,49 +8,74 @@ import jax.numpy as jnp
 import numpy as np
 
 from sqt_jax import rollout
-from sqt_jax.bias import Judgement
+from sqt_jax.bias import BiasSums
 from sqt_jax.types import Array, Environment, Metrics, Transition
 
-JudgedPolicy = Callable[[Array, Array], tuple[Array, Array]]  # obs [E, O], key -> action [E, A], entropy bonus [E]
-Critics = Callable[[Array, Array], Array]  # obs [E, O], action [E, A] -> [N, E]
-Seen = TypeVar("Seen")
+PolicyWithBonus = Callable[[Array, Array], tuple[Array, Array]]  # obs [E, O], key -> action [E, A], entropy bonus [E]
+Critics = Callable[[Array, Array], Array]  # obs [K, O], action [K, A] -> [N, K]
+Extra = TypeVar("Extra")
 
 
 class Evaluation(NamedTuple):
-    returns: Array  # [episodes]: undiscounted
-    lengths: Array  # [episodes]: steps
+    """The results of some episodes: [episodes] each."""
+
+    returns: Array  # undiscounted
+    lengths: Array  # int32: steps
+    # Mean forward speed over the steps, m/s. The step that ends the episode is left out: the state after it is the
+    # start of the next episode. NaN if the environment has no `speed`, or the episode only one step.
+    speeds: Array
 
 
 def evaluate(env: Environment, policy: rollout.Policy, key: Array, num_episodes: int) -> Evaluation:
-    """Runs `num_episodes` episodes side by side, each to its own end."""
+    """Play episodes in parallel, each until its own end.
 
-    return _play(env, lambda obs, key: (policy(obs), None), key, num_episodes, None, lambda seen, step: seen)[0]
+    Args:
+      policy: obs [E, O] -> action [E, A], with E = `num_episodes`.
+      key: draws the starts.
+    """
+    return _play(env, lambda obs, key: (policy(obs), None), key, num_episodes, None, lambda extra, step: extra)[0]
 
 
-def evaluate_and_judge(
-    env: Environment, policy: JudgedPolicy, critics: Critics, gamma: Array, key: Array, num_episodes: int, judged: int
+def evaluate_with_bias(
+    env: Environment,
+    policy: PolicyWithBonus,
+    critics: Critics,
+    gamma: Array,
+    key: Array,
+    num_episodes: int,
+    num_bias_episodes: int,
 ) -> tuple[Evaluation, Metrics]:
-    """`evaluate`, and the bias of the critics' values along the last `judged` of the episodes (`bias.Judgement`)."""
+    """`evaluate`, and the bias of the critics along the last `num_bias_episodes` episodes.
 
-    def watch(seen: tuple[Judgement, Array], step: _Step) -> tuple[Judgement, Array]:
-        judgement, terminated = seen
-        transition = jax.tree.map(lambda x: x[-judged:], step.transition)
-        running, bonus = step.running[-judged:], step.bonus[-judged:]
+    Args:
+      policy: obs [E, O], key -> action [E, A] and its entropy bonus [E] (0 without an entropy term), with E =
+        `num_episodes`.
+      critics: obs [K, O], action [K, A] -> [N, K], with K = `num_bias_episodes`.
+      gamma: [], the discount factor of the critics.
+      key: draws the starts and the policy's keys.
+
+    Returns:
+      All episodes' results, and the metrics `bias.NAMES` ([] each, see `BiasSums.result`).
+    """
+
+    def add(extra: tuple[BiasSums, Array], step: _Step) -> tuple[BiasSums, Array]:
+        sums, terminated = extra
+        transition = jax.tree.map(lambda x: x[-num_bias_episodes:], step.transition)
+        running, bonus = step.running[-num_bias_episodes:], step.bonus[-num_bias_episodes:]
         q = critics(transition.obs, transition.action)
-        steps_left = env.episode_length - step.number
-        judgement = judgement.add(running, steps_left, transition.reward, bonus, q, gamma)
-        return judgement, terminated | (running & (transition.discount == 0))
+        sums = sums.add(running, env.episode_length - step.number, transition.reward, bonus, q, gamma)
+        return sums, terminated | (running & (transition.discount == 0))
 
-    seen = Judgement.start(judged), jnp.zeros(judged, bool)
-    evaluation, (judgement, terminated) = _play(env, policy, key, num_episodes, seen, watch)
-    return evaluation, judgement.result(terminated)
+    extra = BiasSums.start(num_bias_episodes), jnp.zeros(num_bias_episodes, bool)
+    evaluation, (sums, terminated) = _play(env, policy, key, num_episodes, extra, add)
+    return evaluation, sums.result(terminated)
 
 
 class _Step(NamedTuple):
-    number: Array  # [] int32, of the episodes, from 0
-    running: Array  # [E] bool: whether the episode was still going on before it
+    number: Array  # [] int32: steps before this one, the same in all episodes
+    running: Array  # [E] bool: whether the episode had not ended before this step
     transition: Transition  # [E, ...]
-    bonus: Any  # what the policy gave beside the action
+    bonus: Any  # the policy's second output
 
 
 def _play(
@@ -58,58 +83,62 @@ def _play(
     policy: Callable[[Array, Array], tuple[Array, Any]],
     key: Array,
     num_episodes: int,
-    seen: Seen,
-    watch: Callable[[Seen, _Step], Seen],
-) -> tuple[Evaluation, Seen]:
-    """Episodes side by side; `seen` is what `watch` makes of each of their steps."""
+    extra: Extra,
+    add: Callable[[Extra, _Step], Extra],
+) -> tuple[Evaluation, Extra]:
+    """Play episodes in parallel; `extra` is updated by `add(extra, step)` at each step."""
 
-    # `reset` makes the episodes' keys of `key` by their small numbers: the policy's have to be others.
+    # `rollout.reset` splits `key` into the episodes' keys; the policy needs different ones.
     policy_key = jax.random.fold_in(key, 2**31)
 
-    def episode_runs(carry):
+    def any_running(carry):
         return jnp.any(carry[2])
 
     def body(carry):
-        number, timestep, running, evaluation, seen = carry
+        number, timestep, running, (returns, lengths, speed_sums), extra = carry
         action, bonus = policy(timestep.obs, jax.random.fold_in(policy_key, number))
         timestep, transition = rollout.step(env, timestep, lambda obs: action)
-        seen = watch(seen, _Step(number, running, transition, bonus))
-        evaluation = Evaluation(
-            returns=evaluation.returns + jnp.where(running, transition.reward, 0.0),
-            lengths=evaluation.lengths + running,
-        )
-        return number + 1, timestep, running & ~(timestep.terminated | timestep.truncated), evaluation, seen
+        extra = add(extra, _Step(number=number, running=running, transition=transition, bonus=bonus))
+        returns += jnp.where(running, transition.reward, 0.0)
+        lengths += running
+        running &= ~(timestep.terminated | timestep.truncated)
+        if env.speed:
+            speed_sums += jnp.where(running, jax.vmap(env.speed)(timestep), 0.0)
+        return number + 1, timestep, running, (returns, lengths, speed_sums), extra
 
-    nothing = Evaluation(jnp.zeros(num_episodes), jnp.zeros(num_episodes, jnp.int32))
+    totals = jnp.zeros(num_episodes), jnp.zeros(num_episodes, jnp.int32), jnp.zeros(num_episodes)
     start = rollout.reset(env, key, num_episodes)
-    carry = (jnp.zeros((), jnp.int32), start, jnp.ones(num_episodes, bool), nothing, seen)
-    *_, evaluation, seen = jax.lax.while_loop(episode_runs, body, carry)
-    return evaluation, seen
+    carry = (jnp.zeros((), jnp.int32), start, jnp.ones(num_episodes, bool), totals, extra)
+    *_, (returns, lengths, speed_sums), extra = jax.lax.while_loop(any_running, body, carry)
+    counted = lengths - 1 if env.speed else jnp.zeros_like(lengths)
+    speeds = jnp.where(counted > 0, speed_sums / jnp.maximum(counted, 1), jnp.nan)
+    return Evaluation(returns=returns, lengths=lengths, speeds=speeds), extra
 
 
 def evaluate_policy(
     policy: Callable[[Any], Any], env: Any, num_episodes: int = 10, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Plays a policy, such as `load_policy` gives, in any environment with its sizes.
+    """Play a policy (for example from `load_policy`) in an environment with its observation and action sizes.
 
     Args:
-      policy: obs [B, O] -> action [B, A] in [-1, 1]; with an `Environment` it is traced, and has to be JAX code.
-      env: an `Environment` on any physics, or one of Gymnasium's, whose action space is a bounded box and whose
-        episodes end (made by `gymnasium.make`, they have a time limit).
-      seed: of all the starts; Gymnasium's episode k expects `seed + k`.
+      policy: obs [B, O] -> action [B, A] in [-1, 1]. With an `Environment` it is traced, so it has to be JAX code.
+      env: an `Environment`, or a Gymnasium environment with a bounded box as its action space and episodes that end
+        (those of `gymnasium.make` have a time limit).
+      num_episodes: episodes to play.
+      seed: of the starts; Gymnasium's episode k starts with `reset(seed=seed + k)`.
 
     Returns:
-      Undiscounted returns [episodes] and lengths [episodes].
+      Undiscounted returns [episodes] and lengths [episodes], in steps.
 
     Raises:
-      ValueError: a Gymnasium environment's actions have no bounds.
+      ValueError: the actions of a Gymnasium environment have no bounds.
     """
     if isinstance(env, Environment):
         result = jax.jit(lambda key: evaluate(env, policy, key, num_episodes))(jax.random.key(seed))
         return np.asarray(result.returns), np.asarray(result.lengths)
     low, high = (getattr(env.action_space, side, np.inf) for side in ("low", "high"))
     if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
-        raise ValueError(f"an action space with bounds is needed, not {env.action_space}")
+        raise ValueError(f"expected an action space with bounds, got {env.action_space}")
     returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, int)
     for episode in range(num_episodes):
         obs, _ = env.reset(seed=seed + episode)

@@ -1,9 +1,9 @@
-"""A trained policy on disk: parameters as plain arrays, settings as JSON. Loading executes nothing.
+"""A trained policy on disk: parameters as plain arrays, settings as JSON. Loading executes no code from the files.
 
-policy/config.json     settings and sizes
-policy/member_0.npz    what acting needs of member 0, by path ("params/layer0/kernel")
-policy/act.stablehlo   the function (arrays of a member, obs [B, O]) -> action [B, A], any B, by `jax.export`: it runs
-                       where this package is not installed
+policy/config.json     settings, and the sizes of observations and actions
+policy/member_0.npz    the parameters that member 0 needs to act, by path ("params/layer0/kernel")
+policy/act.stablehlo   the function (arrays of a member by path, obs [B, O]) -> action [B, A] for any B, made by
+                       `jax.export` (https://docs.jax.dev/en/latest/export/export.html): it runs without this package
 """
 
 import json
@@ -30,37 +30,48 @@ MAX_SIZE = 1_000_000  # of an observation or an action
 def save_policy(
     directory: Path | str, config: Config, env: Environment, agent_state: State, members: int | None = None
 ) -> None:
-    """Writes the policies of the first `members` (None: all) of `agent_state` to a new directory.
+    """Write the policies of a sweep's members to a new directory.
 
     Args:
-      agent_state: of a sweep, with a leading axis of members, [S, ...]; that of one agent, by
+      directory: is created.
+      config: of the run.
+      env: the environment, for its sizes.
+      agent_state: with a leading axis of members, [S, ...]. A single agent's state gets one by
         `jax.tree.map(lambda x: x[None], state)`.
+      members: how many to write, the first ones; None: all.
 
     Raises:
       FileExistsError: the directory exists.
-      ValueError: the state has no axis of members, or is another agent's.
+      ValueError: the state has no axis of members, or is that of another algorithm or of other sizes.
     """
     directory = Path(directory)
     agent = agent_of(config, env)
     arrays = by_path(jax.device_get(agent.views.policy(agent_state)))
     expected = {name: leaf.shape for name, leaf in by_path(_shapes(agent)).items()}
     if {name: array.shape[1:] for name, array in arrays.items()} != expected:
-        raise ValueError(f"agent_state has to be {config.algo}'s with a leading axis of members, [S, ...]")
+        raise ValueError(f"agent_state: expected that of {config.algo} with a leading axis of members, [S, ...]")
     directory.mkdir(parents=True)
     sizes = {"observation_size": env.observation_size, "action_size": env.action_size}
     (directory / "config.json").write_text(json.dumps(config.flat() | sizes, indent=1) + "\n")
     (directory / "act.stablehlo").write_bytes(_exported(agent, env.observation_size))
-    held = next(iter(arrays.values())).shape[0]
-    for member in range(held if members is None else members):
+    num_members = next(iter(arrays.values())).shape[0] if members is None else members
+    for member in range(num_members):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
 
 
 def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Array]:
-    """The deterministic policy of one member: obs [B, O] -> action [B, A] in [-1, 1].
+    """Load the deterministic policy of one member.
+
+    Args:
+      directory: written by `save_policy`.
+      member: its number, from 0.
+
+    Returns:
+      A compiled function obs [B, O] -> action [B, A] in [-1, 1].
 
     Raises:
-      FileNotFoundError: there is no such policy or member.
-      ValueError: a file is damaged, or the parameters are not those of the stated algorithm and sizes.
+      FileNotFoundError: the directory has no policy, or no such member.
+      ValueError: a file is damaged, or the parameters do not fit the algorithm and sizes in config.json.
     """
     directory = Path(directory)
     config, sizes = _read_config(directory / "config.json")
@@ -68,7 +79,9 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
     expected = _shapes(agent)
     arrays = _read_arrays(directory / f"member_{member}.npz", by_path(expected))
     if arrays is None:
-        raise ValueError(f"{directory}: member {member} does not hold a policy of {config.algo} for sizes {sizes}")
+        raise ValueError(
+            f"{directory}: member {member} does not have the parameters of a {config.algo} policy for sizes {sizes}"
+        )
     params = from_paths(expected, {name: jnp.asarray(array) for name, array in arrays.items()})
 
     @jax.jit
@@ -79,18 +92,18 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
 
 
 def _read_config(path: Path) -> tuple[Config, tuple[int, int]]:
-    """Settings, and the sizes of observations and actions."""
+    """The settings in config.json, and the sizes of observations and actions."""
     try:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: there is no such file")
         with path.open("rb") as file:
             content = file.read(MAX_CONFIG_BYTES + 1)
         if len(content) > MAX_CONFIG_BYTES:
-            raise ValueError(f"more than {MAX_CONFIG_BYTES:,} bytes")
+            raise ValueError(f"expected at most {MAX_CONFIG_BYTES:,} bytes")
         settings = json.loads(content)
         sizes = settings.pop("observation_size"), settings.pop("action_size")
         if not all(type(size) is int and 1 <= size <= MAX_SIZE for size in sizes):
-            raise ValueError(f"sizes are whole numbers from 1 to {MAX_SIZE}")
+            raise ValueError(f"expected sizes from 1 to {MAX_SIZE}, got {sizes}")
         return make_config(**settings), sizes
     except FileNotFoundError:
         raise
@@ -99,9 +112,9 @@ def _read_config(path: Path) -> tuple[Config, tuple[int, int]]:
 
 
 def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] | None:
-    """The arrays of an .npz file; None where they are not of the expected names, shapes and types.
+    """The arrays of an .npz file; None if their names, shapes or types are not the expected ones.
 
-    What a file says of its sizes is compared before anything of that size is read.
+    The sizes stated in the file are checked before data of that size is read.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
@@ -114,7 +127,7 @@ def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] 
                 with archive.open(f"{name}.npy") as file:
                     version = np.lib.format.read_magic(file)
                     if version != (1, 0):
-                        raise ValueError(f"arrays of version {version}")
+                        raise ValueError(f"expected arrays of version 1.0, got {version}")
                     shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
                     if (shape, dtype) != (leaf.shape, leaf.dtype):
                         return None
@@ -124,21 +137,22 @@ def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] 
                         raise ValueError(f"{name} is truncated or too long")
                     arrays[name] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
             return arrays
-    except Exception as error:  # whatever zipfile and NumPy say of a file that is not theirs
+    except Exception as error:  # of any type: zipfile and NumPy raise many for a file that is damaged
         raise ValueError(f"{path}: not the parameters of a policy: {_one_line(error)}") from None
 
 
 def _one_line(error: Exception) -> str:
+    """Type and message of an error on one line, at most 300 characters."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
 def _shapes(agent: Agent) -> Any:
-    """What acting needs of one member, as shapes and types."""
+    """The parameters that one member needs to act, as shapes and types."""
     return jax.eval_shape(lambda: agent.views.policy(agent.init(jax.random.key(0))))
 
 
 def _exported(agent: Agent, observation_size: int) -> bytes:
-    """The policy as a function of its arrays by path and of the observations, serialised."""
+    """The policy as a function of its arrays by path and the observations, serialised as StableHLO."""
     policy = _shapes(agent)
 
     def act(arrays: dict[str, Array], obs: Array) -> Array:

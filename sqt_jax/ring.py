@@ -1,9 +1,9 @@
-"""The ring of transitions under both kinds of replay, with each observation stored once.
+"""A ring buffer of transitions that stores each observation once; both kinds of replay use it.
 
-A row of the ring holds a transition without its next observation, which is the observation of the row that the same
-environment fills next. Where it is not, because an episode ended, the true one lies in a smaller ring of final
-observations beside, and the row that comes next says where. An insert is one update of each ring, in place; a read is
-one gather of each.
+A row holds a transition without its `next_obs`: that is the `obs` of the row that the same environment writes next.
+Where an episode ended, the next row begins with the start of another episode. The true `next_obs` is then stored in a
+second, smaller ring of final observations, and the next row holds its index there. An insert is one in-place update of
+each ring; a read is one gather from each.
 """
 
 import math
@@ -14,23 +14,20 @@ import jax.numpy as jnp
 
 from sqt_jax.types import Array, Transition
 
-MAX_FINALS = 2**24  # places up to here are exact as float32
+MAX_FINAL_OBS = 2**24  # a row stores an index into `final_obs` as float32, which is exact up to here
 
 
 class RingState(NamedTuple):
-    """Transitions are numbered in the order in which they come, from 0; number k lies in row k mod capacity.
+    """What a ring holds. Transitions are numbered from 0 in order of arrival; number k is in row k mod capacity."""
 
-    `inserted` is equal in all members of a sweep, which insert in lockstep: an insert is at the same row for all.
-    """
-
-    storage: Array  # [capacity, W]: obs, action, reward, discount, and where the next obs of the row before lies
-    finals: Array  # [F, O]: next observations that no row begins with
-    owners: Array  # [F] int32: the number of the transition that each belongs to; -1: none yet
-    at_risk: Array  # [E] int32: the owners of the next places to be written to
-    newest: Array  # [E, O]: next observations of the newest rows
-    inserted: Array  # [] int32: transitions so far
-    ended: Array  # [] int32: final observations so far
-    whole_from: Array  # [] int32: of the transitions before this one, some have lost their final observation
+    storage: Array  # [capacity, W]: obs, action, reward, discount, index of the previous row's next obs (-1: this obs)
+    final_obs: Array  # [F, O]: next observations of transitions that ended an episode
+    final_owner: Array  # [F] int32: the number of the transition that each belongs to; -1: unused
+    next_overwritten: Array  # [E] int32: owners of the next E entries of `final_obs` to be overwritten; -1: unused
+    last_next_obs: Array  # [E, O]: next observations of the newest E transitions
+    inserted: Array  # [] int32: transitions inserted so far
+    num_finals: Array  # [] int32: final observations inserted so far
+    first_intact: Array  # [] int32: transitions with a smaller number may have lost their next observation
 
 
 class Ring(NamedTuple):
@@ -38,123 +35,149 @@ class Ring(NamedTuple):
 
     Args:
       capacity: transitions, a multiple of `num_envs`.
-      num_envs: E, transitions that are inserted at once, one per environment.
-      shortest_episode: steps that episodes take at least, in the mean over a full ring. Room for final observations is
-        made for these; where episodes are shorter, the oldest transitions are given up before their rows are. With 1
-        none ever is (up to a capacity of `MAX_FINALS`), and nothing is saved.
+      observation_size: O.
+      action_size: A.
+      num_envs: E, transitions inserted at once, one per environment.
+      min_mean_episode_length: memory hint: a lower bound on the mean episode length, in steps. 1 is always safe (up to
+        a capacity of `MAX_FINAL_OBS`); with a larger value the ring of final observations is smaller. If episodes turn
+        out shorter, the oldest transitions become unavailable before their rows are overwritten; none is ever wrong.
     """
 
     capacity: int
     observation_size: int
     action_size: int
     num_envs: int = 1
-    shortest_episode: int = 1
+    min_mean_episode_length: int = 1
 
     @property
     def width(self) -> int:
-        """W, floats of a row."""
+        """W, floats in a row."""
         return self.observation_size + self.action_size + 3
 
     @property
-    def finals(self) -> int:
-        """F, final observations that there is room for."""
-        return min(math.ceil(self.capacity / self.shortest_episode) + self.num_envs, MAX_FINALS)
+    def final_capacity(self) -> int:
+        """F, the capacity of the ring of final observations."""
+        return min(math.ceil(self.capacity / self.min_mean_episode_length) + self.num_envs, MAX_FINAL_OBS)
 
     def init(self) -> RingState:
-        """Raises ValueError for a capacity that is no multiple of `num_envs`: an insert would straddle the end."""
+        """An empty ring.
+
+        Raises:
+          ValueError: the capacity is 0 or no multiple of `num_envs`: an insert would cross the end.
+        """
         if self.capacity % self.num_envs or not self.capacity:
             raise ValueError(
                 f"the capacity ({self.capacity}) must be a multiple of the rows inserted at once ({self.num_envs})"
             )
-        # An array each: a buffer can be donated once only.
-        counts = {name: jnp.zeros((), jnp.int32) for name in ("inserted", "ended", "whole_from")}
         return RingState(
             storage=jnp.zeros((self.capacity, self.width), jnp.float32),
-            finals=jnp.zeros((self.finals, self.observation_size), jnp.float32),
-            owners=jnp.full(self.finals, -1, jnp.int32),
-            at_risk=jnp.full(self.num_envs, -1, jnp.int32),
-            newest=jnp.zeros((self.num_envs, self.observation_size), jnp.float32),
-            **counts,
+            final_obs=jnp.zeros((self.final_capacity, self.observation_size), jnp.float32),
+            final_owner=jnp.full(self.final_capacity, -1, jnp.int32),
+            next_overwritten=jnp.full(self.num_envs, -1, jnp.int32),
+            last_next_obs=jnp.zeros((self.num_envs, self.observation_size), jnp.float32),
+            # Three arrays, not one used three times: a buffer can be donated only once.
+            inserted=jnp.zeros((), jnp.int32),
+            num_finals=jnp.zeros((), jnp.int32),
+            first_intact=jnp.zeros((), jnp.int32),
         )
 
     def member_axes(self) -> RingState:
-        """`vmap` axes: 0, and None for the count of transitions, which lockstep members share."""
-        return RingState(**dict.fromkeys(RingState._fields, 0) | {"inserted": None})  # type: ignore[arg-type]
+        """`jax.vmap`'s axes for the state of a sweep's members: 0 for their own fields, None for shared ones.
+
+        Members insert in lockstep, so `inserted` is equal in all of them. It has no member axis: an insert is then a
+        slice update at one row for all, not a scatter.
+        """
+        axes = RingState(*[0] * len(RingState._fields))  # type: ignore[arg-type]
+        return axes._replace(inserted=None)  # type: ignore[arg-type]
 
     def insert(self, state: RingState, transition: Transition) -> tuple[RingState, Array]:
-        """Takes E transitions, [E, ...]; gives also the numbers of those that lost their final observation, [E] or -1.
+        """Insert E transitions.
+
+        Args:
+          state: of this ring.
+          transition: E transitions, [E, ...], one per environment and always in the same order.
+
+        Returns:
+          The new state, and the numbers of the transitions whose final observation was overwritten: [E] int32, -1
+          where none was.
 
         Raises:
-          ValueError: other than E transitions of these sizes.
+          ValueError: the transitions have other shapes.
         """
         e, o, a = self.num_envs, self.observation_size, self.action_size
-        wanted = {"obs": (e, o), "action": (e, a), "reward": (e,), "next_obs": (e, o), "discount": (e,)}
-        given = {name: jnp.shape(value) for name, value in transition._asdict().items()}
-        if given != wanted:
-            raise ValueError(f"expects transitions of {wanted}, not {given}")
-        before = state.inserted - self.num_envs + jnp.arange(self.num_envs)  # the numbers of the rows before
-        final = (before >= 0) & jnp.any(state.newest != transition.obs, axis=-1)
-        order = jnp.cumsum(final, dtype=jnp.int32) - 1
-        lost = jnp.where(final, state.at_risk[order], -1)
-        place = jnp.where(final, (state.ended + order) % self.finals, -1)
+        expected = {"obs": (e, o), "action": (e, a), "reward": (e,), "next_obs": (e, o), "discount": (e,)}
+        shapes = {name: jnp.shape(value) for name, value in transition._asdict().items()}
+        if shapes != expected:
+            raise ValueError(f"expected transitions of {expected}, got {shapes}")
+        previous = state.inserted - self.num_envs + jnp.arange(self.num_envs)  # numbers of the E rows before these
+        ended = (previous >= 0) & jnp.any(state.last_next_obs != transition.obs, axis=-1)
+        order = jnp.cumsum(ended, dtype=jnp.int32) - 1
+        lost = jnp.where(ended, state.next_overwritten[order], -1)
+        place = jnp.where(ended, (state.num_finals + order) % self.final_capacity, -1)
         columns = transition.reward, transition.discount, place.astype(jnp.float32)
         rows = jnp.concatenate([transition.obs, transition.action, jnp.stack(columns, axis=-1)], axis=-1)
-        written = jnp.where(final, place, self.finals)  # there is no such place: nothing is written
-        owners = state.owners.at[written].set(before, mode="drop")
-        ended = state.ended + jnp.sum(final, dtype=jnp.int32)
+        written = jnp.where(ended, place, self.final_capacity)  # out of bounds: nothing is written
+        final_owner = state.final_owner.at[written].set(previous, mode="drop")
+        num_finals = state.num_finals + jnp.sum(ended, dtype=jnp.int32)
         return RingState(
             storage=jax.lax.dynamic_update_slice_in_dim(state.storage, rows, state.inserted % self.capacity, axis=0),
-            finals=state.finals.at[written].set(state.newest, mode="drop"),
-            owners=owners,
-            # Read here for the next time: XLA would copy what is read before it is written to.
-            at_risk=owners[(ended + jnp.arange(self.num_envs)) % self.finals],
-            newest=transition.next_obs,
+            final_obs=state.final_obs.at[written].set(state.last_next_obs, mode="drop"),
+            final_owner=final_owner,
+            # Read now for the next insert: reading an array just before writing to it makes XLA copy it.
+            next_overwritten=final_owner[(num_finals + jnp.arange(self.num_envs)) % self.final_capacity],
+            last_next_obs=transition.next_obs,
             inserted=state.inserted + self.num_envs,
-            ended=ended,
-            whole_from=jnp.maximum(state.whole_from, jnp.max(lost) + 1),
+            num_finals=num_finals,
+            first_intact=jnp.maximum(state.first_intact, jnp.max(lost) + 1),
         ), lost
 
     def oldest(self, state: RingState) -> Array:
-        """The number of the first of the transitions that are all still there: []"""
-        return jnp.maximum(state.inserted - self.capacity, state.whole_from)
+        """The number of the oldest transition from which on all are available: [] int32"""
+        return jnp.maximum(state.inserted - self.capacity, state.first_intact)
 
     def size(self, state: RingState) -> Array:
-        """How many these are: []"""
+        """How many transitions are available, from `oldest` to the newest: [] int32"""
         return state.inserted - self.oldest(state)
 
     def read(self, state: RingState, index: Array) -> Transition:
-        """The transitions in rows `index [B]`."""
+        """The transitions in rows `index [B]`: [B, ...]"""
         o, a = self.observation_size, self.action_size
         following = (index + self.num_envs) % self.capacity
         row, next_row = jnp.split(state.storage[jnp.concatenate([index, following])], 2)
         place = next_row[:, -1].astype(jnp.int32)
-        next_obs = jnp.where(place[:, None] < 0, next_row[:, :o], state.finals[jnp.maximum(place, 0)])
-        # What follows the newest rows in the ring is not what comes after them.
+        next_obs = jnp.where(place[:, None] < 0, next_row[:, :o], state.final_obs[jnp.maximum(place, 0)])
+        # The rows that follow the newest E are the oldest: the next observations of the newest are in `last_next_obs`.
         env = (index - state.inserted) % self.capacity - (self.capacity - self.num_envs)
-        next_obs = jnp.where(env[:, None] < 0, next_obs, state.newest[jnp.maximum(env, 0)])
-        return Transition(row[:, :o], row[:, o : o + a], row[:, o + a], next_obs, row[:, o + a + 1])
+        next_obs = jnp.where(env[:, None] < 0, next_obs, state.last_next_obs[jnp.maximum(env, 0)])
+        return Transition(
+            obs=row[:, :o],
+            action=row[:, o : o + a],
+            reward=row[:, o + a],
+            next_obs=next_obs,
+            discount=row[:, o + a + 1],
+        )
 
-    # What checkpoints hold of it: rows that never change, each with the final observation that it points to.
+    # For checkpoints: a row never changes until it is overwritten. It is saved with the final observation it points to.
 
     def rows(self, state: RingState, first: Array | int, count: int) -> Array:
-        """The rows `first`, `first + 1`, ..., which do not go round the end: [count, W + O]"""
+        """Rows `first` to `first + count - 1`, which must not cross the end, to be saved: [count, W + O]"""
         rows = jax.lax.dynamic_slice_in_dim(state.storage, first, count)
         place = rows[:, -1].astype(jnp.int32)
-        final = jnp.where(place[:, None] < 0, 0.0, state.finals[jnp.maximum(place, 0)])
-        return jnp.concatenate([rows, final], axis=-1)
+        final_obs = jnp.where(place[:, None] < 0, 0.0, state.final_obs[jnp.maximum(place, 0)])
+        return jnp.concatenate([rows, final_obs], axis=-1)
 
     def with_rows(self, state: RingState, rows: Array, first: Array | int) -> RingState:
-        """The state with rows [count, W + O] as `rows` gave them at `first`; older ones have to come before."""
-        rows, final = rows[:, : self.width], rows[:, self.width :]
+        """The state with saved rows [count, W + O] put back at `first`; restore older rows before newer ones."""
+        rows, final_obs = rows[:, : self.width], rows[:, self.width :]
         place = rows[:, -1].astype(jnp.int32)
-        # Of two with one place the newer: a place is used again after `finals` others.
+        # A place is used again after `final_capacity` others: of two rows with the same place, the newer one counts.
         since = jnp.cumsum((place >= 0)[::-1], dtype=jnp.int32)[::-1]
-        written = jnp.where((place >= 0) & (since <= self.finals), place, self.finals)
+        written = jnp.where((place >= 0) & (since <= self.final_capacity), place, self.final_capacity)
         return state._replace(
             storage=jax.lax.dynamic_update_slice_in_dim(state.storage, rows, first, axis=0),
-            finals=state.finals.at[written].set(final, mode="drop"),
+            final_obs=state.final_obs.at[written].set(final_obs, mode="drop"),
         )
 
     def without_rows(self, state: RingState) -> RingState:
-        """The state without what `with_rows` brings back: None in its places."""
-        return state._replace(storage=None, finals=None)  # type: ignore[arg-type]
+        """The state without the arrays that `with_rows` restores: None in their fields."""
+        return state._replace(storage=None, final_obs=None)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""One lockstep step of a member's E environments under a policy, and the bookkeeping of its episodes."""
+"""One step of a member's E environments under a policy, and the returns and lengths of their episodes."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,21 +12,30 @@ Policy = Callable[[Array], Array]  # obs [E, O] -> action [E, A]
 
 
 class Episodes(NamedTuple):
-    """Undiscounted returns and lengths of the running episodes, and sums over those that ended."""
+    """Undiscounted returns and lengths of the running episodes, and sums over those that have ended."""
 
     running_return: Array  # [E]
-    running_length: Array  # [E]
-    ended_return: Array  # []: sum
-    ended_length: Array  # []: sum
-    ended: Array  # []: count
+    running_length: Array  # [E], steps
+    ended_return: Array  # []: sum over the episodes that ended since `forget_ended`
+    ended_length: Array  # []: sum over these, steps
+    ended: Array  # []: their number
 
     @classmethod
     def start(cls, num_envs: int) -> "Episodes":
+        """Before the first step of E = `num_envs` episodes."""
         zeros, zero = jnp.zeros(num_envs), jnp.zeros(())
-        return cls(zeros, zeros, zero, zero, zero)
+        return cls(running_return=zeros, running_length=zeros, ended_return=zero, ended_length=zero, ended=zero)
 
     def add(self, reward: Array, over: Array) -> tuple["Episodes", Array]:
-        """Takes reward [E] and over [E] bool (the episodes that end with it); gives the returns up to here too, [E]."""
+        """One step of each episode.
+
+        Args:
+          reward: [E], of the step.
+          over: [E] bool, whether the episode ended with the step.
+
+        Returns:
+          The new counts, and the returns up to and including this step, [E].
+        """
         total, length = self.running_return + reward, self.running_length + 1
         episodes = Episodes(
             running_return=jnp.where(over, 0.0, total),
@@ -38,8 +47,8 @@ class Episodes(NamedTuple):
         return episodes, total
 
     def forget_ended(self) -> "Episodes":
-        """The sums begin anew, the running episodes go on."""
-        # An array each: a buffer can be donated once only.
+        """Reset the sums over ended episodes; the running ones continue."""
+        # Three arrays, not one used three times: a buffer can be donated only once.
         return self._replace(
             ended_return=jnp.zeros_like(self.ended_return),
             ended_length=jnp.zeros_like(self.ended_length),
@@ -48,12 +57,20 @@ class Episodes(NamedTuple):
 
 
 def reset(env: Environment, key: Array, num_envs: int) -> TimeStep:
-    """First time steps of `num_envs` environments, [E, ...]."""
+    """The first time steps of E = `num_envs` environments, each with its own key: [E, ...]"""
     return jax.vmap(env.reset)(jax.random.split(key, num_envs))
 
 
 def step(env: Environment, timestep: TimeStep, policy: Policy) -> tuple[TimeStep, Transition]:
-    """Acts once in each of E environments and gives what the replay stores of it, [E, ...]."""
+    """One step in each of E environments.
+
+    Args:
+      timestep: [E, ...].
+      policy: obs [E, O] -> action [E, A].
+
+    Returns:
+      The next time steps, and the transitions for the replay: [E, ...] each.
+    """
     action = policy(timestep.obs)
     following = jax.vmap(env.step)(timestep, action)
     transition = Transition(
@@ -67,5 +84,5 @@ def step(env: Environment, timestep: TimeStep, policy: Policy) -> tuple[TimeStep
 
 
 def uniform_actions(key: Array, num_envs: int, action_size: int) -> Array:
-    """The warm-up's actions, uniform in [-1, 1]: [E, A]"""
+    """Random actions for the warm-up, uniform in [-1, 1]: [E, A]"""
     return jax.random.uniform(key, (num_envs, action_size), minval=-1.0, maxval=1.0)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from sqt_jax import rollout
 from sqt_jax.config import TrainConfig
-from sqt_jax.evaluate import Evaluation, evaluate_and_judge
+from sqt_jax.evaluate import Evaluation, evaluate_with_bias
 from sqt_jax.members import Layout, every_leaf
 from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep
 
@@ -185,7 +185,9 @@ def make_trainer(
 
         episodes = 2 * count if views.sample else count
         gamma = state.agent.scalars.gamma
-        played, bias = evaluate_and_judge(eval_env or env, policy, critics, gamma, key, episodes, judged=count)
+        played, bias = evaluate_with_bias(
+            eval_env or env, policy, critics, gamma, key, episodes, num_bias_episodes=count
+        )
         return jax.tree.map(lambda x: x[:count], played), bias
 
     def measure(state: TrainState) -> Metrics:

@@ -1,4 +1,4 @@
-"""Trees of arrays: names of their leaves, and selections between two of a kind."""
+"""Helpers for trees of arrays: leaves by path, and a selection between two trees."""
 
 from typing import Any
 
@@ -9,16 +9,20 @@ from sqt_jax.types import Array
 
 
 def by_path(tree: Any) -> dict[str, Any]:
-    """Leaves by their path, "params/layer0/kernel", in the order of the tree."""
+    """The leaves by their path (for example "params/layer0/kernel"), in the order of the tree."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def from_paths(like: Any, leaves: dict[str, Any]) -> Any:
-    """The tree of the structure of `like` with these leaves, which `by_path` gave."""
+    """The inverse of `by_path`: a tree with the structure of `like` and these leaves by path.
+
+    Raises:
+      KeyError: a leaf is missing; further leaves are ignored.
+    """
     return jax.tree.unflatten(jax.tree.structure(like), [leaves[path] for path in by_path(like)])
 
 
 def where(condition: Array, a: Any, b: Any) -> Any:
-    """`a` where `condition` [] holds, else `b`, leaf by leaf."""
+    """`a` if `condition` [] holds, else `b`: two trees of the same structure and shapes."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)

@@ -62,7 +62,9 @@ class Environment(NamedTuple):
     set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
     status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts to report, summed over environments
     # A lower bound on the mean episode length. 1 is always safe; a larger one saves memory in the replay (`Ring`).
-    shortest_episode: int = 1
+    min_mean_episode_length: int = 1
+    # Forward speed in m/s of the step that led to this time step; None: the environment has no such notion.
+    speed: Callable[[TimeStep], Array] | None = None
 
 
 class Scalars(NamedTuple):

@@ -26,12 +26,12 @@ def one_step() -> Environment:
 
 def shorter_than_it_says() -> Environment:
     """`one_step`, whose replay has room for the final observations of longer episodes."""
-    return one_step()._replace(shortest_episode=8)
+    return one_step()._replace(min_mean_episode_length=8)
 
 
 @functools.cache  # the same environment is the same object, so that its runs can share their programs
 def constant_reward(episode_length: int = 5) -> Environment:
-    """Reward 1 for ever; episodes end by the time limit alone, so Q = 1 / (1 - gamma) everywhere."""
+    """Reward 1 for ever; only the time limit ends episodes, so Q = 1 / (1 - gamma) everywhere."""
 
     def start(key):
         obs = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)

@@ -9,7 +9,7 @@ from experiments.run import main
 from sqt_jax import envs
 from sqt_jax.algorithms import make_config
 from sqt_jax.config import ConfigError
-from sqt_jax.envs.brax_envs import NAMES, PIPELINES
+from sqt_jax.envs.brax_envs import NAMES, PHYSICS
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Brax's own
 NAME = "brax:inverted_pendulum"  # the smallest: it compiles in seconds
@@ -68,8 +68,8 @@ def test_the_time_limit_truncates(pendulum):
 SLOW = {name: pytest.param(name, marks=pytest.mark.slow) for name in ("mjx", "generalized", "positional")}
 
 
-@pytest.mark.parametrize("physics", [SLOW.get(name, name) for name in PIPELINES])
-def test_every_pipeline_makes_steps_and_is_compiled_once(physics):
+@pytest.mark.parametrize("physics", [SLOW.get(name, name) for name in PHYSICS])
+def test_every_physics_makes_steps_and_compiles_once(physics):
     env = envs.make(NAME, physics)
     assert (env.observation_size, env.action_size, env.name) == (4, 1, NAME)
     step = jax.jit(env.step)
@@ -82,9 +82,9 @@ def test_every_pipeline_makes_steps_and_is_compiled_once(physics):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_every_name_steps_on_all_that_it_says_can_compute_it(name):
+def test_every_environment_steps_on_each_of_its_physics(name):
     """Traced, not compiled."""
-    for physics in envs.simulators(name):
+    for physics in envs.physics_of(name):
         env = envs.make(name, physics)
         timestep = jax.eval_shape(env.reset, jax.random.key(0))
         after = jax.eval_shape(env.step, timestep, jax.ShapeDtypeStruct((env.action_size,), jnp.float32))
@@ -100,8 +100,8 @@ def test_a_run_trains_on_brax(tmp_path):
     assert (tmp_path / NAME / "td3_sqt" / "tiny" / "policy" / "member_1.npz").exists()
 
 
-def test_the_swimmer_has_one_pipeline_and_takes_it_by_itself():
-    assert envs.simulators("brax:swimmer") == ("generalized",)
+def test_the_swimmers_only_physics_is_its_default():
+    assert envs.physics_of("brax:swimmer") == ("generalized",)
     assert make_config("td3", "brax:swimmer").physics == "generalized"
     with pytest.raises(ConfigError, match="--physics: expects one of generalized, not 'mjx' for brax:swimmer"):
         make_config("td3", "brax:swimmer", physics="mjx")
@@ -112,12 +112,12 @@ def test_the_swimmer_has_one_pipeline_and_takes_it_by_itself():
 @pytest.mark.parametrize(
     ("name", "physics", "message"),
     [
-        ("brax:ant", "mujoco", "physics expects one of mjx, generalized, spring, positional, not 'mujoco'"),
-        ("ant", "spring", "physics expects one of mjx, mujoco, warp, not 'spring'"),
-        ("brax:antt", "mjx", "not 'brax:antt'; did you mean brax:ant?"),
+        ("brax:ant", "mujoco", "physics: expects one of mjx, generalized, spring, positional, not 'mujoco'"),
+        ("ant", "spring", "physics: expects one of mjx, mujoco, warp, not 'spring'"),
+        ("brax:antt", "mjx", "got 'brax:antt'; did you mean brax:ant?"),
     ],
 )
-def test_what_brax_has_not_is_refused(name, physics, message):
+def test_unknown_names_and_physics_are_rejected(name, physics, message):
     with pytest.raises(ValueError) as error:
         envs.make(name, physics)
     assert message in str(error.value)

@@ -64,9 +64,9 @@ def same(one, other):
         replay = state.replay
         ring = getattr(replay, "rows", replay)
         stored = ring.storage[..., -1].astype(int)
-        needed = jnp.any(stored[:, :, None] == jnp.arange(ring.finals.shape[1]), axis=1)
-        finals = jnp.where(needed[..., None], ring.finals, 0.0)
-        ring = ring._replace(finals=finals)
+        needed = jnp.any(stored[:, :, None] == jnp.arange(ring.final_obs.shape[1]), axis=1)
+        final_obs = jnp.where(needed[..., None], ring.final_obs, 0.0)
+        ring = ring._replace(final_obs=final_obs)
         return state._replace(replay=replay._replace(rows=ring) if hasattr(replay, "rows") else ring)
 
     return identical(held(one), held(other))

@@ -1,4 +1,4 @@
-"""A branch for few steps: the same as a selection, under any nesting of vmap, and not run where nothing asks for it."""
+"""`cond_if_any` has the values of a select under any nesting of vmap, and runs its branch only if an entry needs it."""
 
 import re
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sqt_jax.conditional import rarely
+from sqt_jax.conditional import cond_if_any
 
 
 def branch(old, given):
@@ -16,7 +16,7 @@ def branch(old, given):
 
 
 def step(predicate, old, given):
-    return rarely(predicate, branch, old, given=given)
+    return cond_if_any(predicate, branch, old, given=given)
 
 
 def selected(predicate, old, given):
@@ -45,7 +45,7 @@ def test_it_is_a_selection_under_any_nesting_of_vmap(shape, maybe_jit):
         assert same(maybe_jit(ours)(*everywhere), expected(*everywhere))
 
 
-def test_what_is_not_batched_is_shared():
+def test_unbatched_arguments_are_shared():
     predicate, old, given = arguments(6)
     one = jax.tree.map(lambda leaf: leaf[0], old)
     assert same(
@@ -59,7 +59,7 @@ def test_what_is_not_batched_is_shared():
 
 
 def test_the_branch_is_one_in_the_compiled_loop():
-    """A conditional, and outside of it no selection of the state."""
+    """One conditional, and no select of the state outside of it."""
 
     def loop(old, given):
         def body(i, old):
@@ -70,13 +70,13 @@ def test_the_branch_is_one_in_the_compiled_loop():
     _, old, given = arguments(4, 3)
     text = jax.jit(loop).lower(old, given).compile().as_text()
     assert len(re.findall(r" conditional\(", text)) == 1
-    # What holds the state in the loop itself: the conditional's results and what passes them on.
+    # In the loop itself only the conditional's result and its forwarding have the state's shape.
     body = next(part for part in text.split("\n\n") if " conditional(" in part)
     kinds = set(re.findall(r"= f32\[4,3,3\]\S* ([\w-]+)\(", body))
     assert kinds <= {"get-tuple-element", "parameter"}, kinds
 
 
-def test_the_branch_runs_only_where_it_is_asked_for():
+def test_the_branch_runs_only_if_the_predicate_holds_for_an_entry():
     runs = []
 
     def counted(old, given):
@@ -84,9 +84,18 @@ def test_the_branch_runs_only_where_it_is_asked_for():
         return old + 1
 
     def at(predicate):
-        out = jax.jit(jax.vmap(lambda p, old: rarely(p, counted, old)))(predicate, jnp.zeros(4))
+        out = jax.jit(jax.vmap(lambda p, old: cond_if_any(p, counted, old)))(predicate, jnp.zeros(4))
         jax.effects_barrier()
         return out.tolist()
 
     assert at(jnp.zeros(4, bool)) == [0, 0, 0, 0] and not runs
     assert at(jnp.arange(4) == 2) == [0, 0, 1, 0] and runs
+
+
+def test_derivatives_are_forward_only():
+    def double(x):
+        return cond_if_any(x > 0, lambda old, given: 2 * old, x)
+
+    assert jax.jvp(double, (1.0,), (1.0,)) == (2.0, 2.0)
+    with pytest.raises(ValueError, match="reverse-mode"):
+        jax.grad(double)(1.0)

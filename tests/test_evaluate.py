@@ -10,7 +10,7 @@ from probe_envs import constant_reward, countdown, one_step
 
 from sqt_jax import envs, rollout
 from sqt_jax.envs.autoreset import make_environment
-from sqt_jax.evaluate import evaluate, evaluate_policy
+from sqt_jax.evaluate import evaluate, evaluate_policy, evaluate_with_bias
 
 KEY = jax.random.key(0)
 
@@ -24,7 +24,7 @@ def run(env, policy=zeros, episodes=4, key=KEY):
 
 
 def random_lengths():
-    """Episodes of 1 to 6 steps, drawn at the start; the reward is the number of the step."""
+    """Episodes of 1 to 6 steps, drawn at the start; reward and speed are the number of the step, 1, 2, ..."""
 
     def start(key):
         length = jax.random.randint(key, (), 1, 7)
@@ -34,7 +34,10 @@ def random_lengths():
         step, length = state[0] + 1, state[1]
         return (step, length), length[None].astype(jnp.float32), step.astype(jnp.float32), step >= length
 
-    return make_environment("random_lengths", 1, 1, 100, start, advance)
+    def speed(state):
+        return state[0].astype(jnp.float32)
+
+    return make_environment("random_lengths", 1, 1, 100, start, advance, speed=speed)
 
 
 def test_terminated_episodes():
@@ -56,6 +59,33 @@ def test_each_episode_counts_to_its_own_end_and_no_further():
     result = run(env, episodes=16)
     np.testing.assert_array_equal(result.lengths, lengths)
     np.testing.assert_array_equal(result.returns, lengths * (lengths + 1) / 2)
+
+
+def assert_speeds_by_hand(evaluation):
+    """An episode of n steps has the mean of 1, ..., n - 1, which is n / 2; of one step, none: the last is left out."""
+    lengths = np.asarray(evaluation.lengths)
+    assert (lengths == 1).any() and (lengths == 6).any()
+    np.testing.assert_allclose(evaluation.speeds, np.where(lengths > 1, lengths / 2, np.nan), rtol=1e-6)
+
+
+def test_the_speed_of_an_episode_is_the_mean_over_its_steps_without_the_last():
+    assert_speeds_by_hand(run(random_lengths(), episodes=16))
+
+
+def test_speeds_are_measured_next_to_the_bias():
+    def evaluation(key):
+        policy, critics = lambda obs, key: (zeros(obs), jnp.zeros(len(obs))), lambda obs, action: obs.T
+        return evaluate_with_bias(random_lengths(), policy, critics, jnp.float32(0.9), key, 16, num_bias_episodes=2)[0]
+
+    found, plain = jax.jit(evaluation)(KEY), run(random_lengths(), episodes=16)
+    assert_speeds_by_hand(found)
+    for name, a, b in zip(found._fields, found, plain, strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def test_without_speed_in_the_environment_speeds_are_nan():
+    result = run(constant_reward(5))
+    assert result.speeds.shape == (4,) and np.isnan(result.speeds).all()
 
 
 def test_the_policy_decides():
@@ -126,11 +156,11 @@ def test_actions_are_stretched_to_gymnasiums_action_space():
     np.testing.assert_array_equal(lengths, [3, 3])
 
 
-def test_actions_without_bounds_are_refused():
+def test_actions_without_bounds_are_rejected():
     env = Ladder()
     env.action_space = type("Box", (), {"low": np.array([-np.inf]), "high": np.array([1.0])})()
-    with pytest.raises(ValueError, match="an action space with bounds"):
+    with pytest.raises(ValueError, match="expected an action space with bounds"):
         evaluate_policy(lambda obs: obs[:, :1], env)
     env.action_space = type("Discrete", (), {"n": 2})()
-    with pytest.raises(ValueError, match="an action space with bounds"):
+    with pytest.raises(ValueError, match="expected an action space with bounds"):
         evaluate_policy(lambda obs: obs, env)

@@ -12,7 +12,7 @@ import pytest
 from experiments.gymnasium_parity.gymnasium_reference import gymnasium_environment
 from sqt_jax import envs
 from sqt_jax.envs import TASKS, gym_tasks
-from sqt_jax.envs.autoreset import SHORTEST_FALL
+from sqt_jax.envs.autoreset import MIN_STEPS_TO_FALL
 from sqt_jax.envs.physics import PHYSICS, Physics, PhysicsState
 
 
@@ -54,7 +54,7 @@ def test_reward_by_hand(name, control, expected):
         ("ant-v5", [3.0, -0.5], 5e-4 * (1 + 0.25)),  # each force clipped to 1
         ("humanoid", [3000.0, 0], 0),
         ("humanoid-v5", [3000.0, 0], 5e-7 * 9e6),
-        ("humanoid-v5", [9000.0, 0], 10),  # the whole cost clipped to 10
+        ("humanoid-v5", [9000.0, 0], 10),  # the sum is clipped to 10
         ("humanoid_standup", [3000.0, 0], 5e-7 * 9e6),
         ("humanoid_standup-v5", [-9000.0, 0], 10),
     ],
@@ -65,44 +65,6 @@ def test_cost_of_contacts(name, forces, cost):
         return gym_tasks.reward(TASKS[name], there, jnp.zeros(2), 0.05, jnp.zeros((), bool))
 
     np.testing.assert_allclose(reward([0.0, 0.0]) - reward(forces), cost, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "qpos", "healthy"),
-    [
-        ("walker", [9, 1.25, 0], True),
-        ("walker", [9, 0.79, 0], False),
-        ("walker", [9, 2.01, 0], False),
-        ("walker", [9, 1.25, 1.01], False),
-        ("walker", [9, 1.25, -1.01], False),
-        ("ant", [9, 9, 0.21], True),
-        ("ant", [9, 9, 1.0], True),  # its limits are included
-        ("ant", [9, 9, 0.19], False),
-        ("ant", [9, 9, 1.01], False),
-        ("humanoid", [9, 9, 1.4], True),
-        ("humanoid", [9, 9, 1.0], False),  # its limits are not
-        ("humanoid", [9, 9, 2.0], False),
-        ("hopper", [9, 0.71, 0.19], True),
-        ("hopper", [9, 0.69, 0], False),
-        ("hopper", [9, 1.25, 0.21], False),
-        ("hopper", [9, 1.25, -0.21], False),
-        ("hopper", [9, 1.25, 0, 101], False),
-    ],
-)
-def test_healthy_ranges(name, qpos, healthy):
-    for task in (TASKS[name], TASKS[f"{name}-v5"]):
-        assert bool(task.healthy(jnp.asarray(qpos, jnp.float32), jnp.zeros(2))) is healthy
-
-
-def test_the_hopper_falls_by_a_velocity_too():
-    qpos = jnp.array([9, 1.25, 0.0])
-    velocities = {99.0: True, 100.0: False, -101.0: False}
-    assert {v: bool(TASKS["hopper"].healthy(qpos, jnp.array([0, v]))) for v in velocities} == velocities
-
-
-def test_three_tasks_never_terminate():
-    never = {name.removesuffix("-v5") for name, task in TASKS.items() if task.healthy is None}
-    assert never == {"cheetah", "swimmer", "humanoid_standup"}
 
 
 def test_observation_leaves_out_the_horizontal_position():
@@ -181,7 +143,7 @@ def test_a_tasks_options_reach_its_physics_and_give_way_to_the_callers(monkeypat
 
 @pytest.fixture
 def recording_physics(monkeypatch):
-    """A simulator in which nothing moves and the state keeps the last control."""
+    """Physics in which nothing moves and the state keeps the last control."""
 
     def make(setup):
         shapes = {"cinert": setup.model.nbody * 10, "cvel": setup.model.nbody * 6, "qfrc_actuator": setup.model.nv}
@@ -221,5 +183,26 @@ def test_no_constant_action_at_its_limits_makes_a_robot_fall_sooner_than_the_rep
             steps += next((step for step in range(1, 31) if env.step(action)[2]), 30)
         lengths[tuple(corner)] = steps / 3
     shortest = min(lengths.values())
-    assert shortest >= SHORTEST_FALL
+    assert shortest >= MIN_STEPS_TO_FALL
     assert name not in ("hopper", "walker") or shortest < 7  # it is a tight one
+
+
+@pytest.mark.parametrize("name", ["cheetah", "walker", "ant", "hopper", "swimmer"])
+def test_speed_is_gymnasiums_x_velocity(name):
+    theirs, ours = gymnasium_environment(name), envs.make(name, "mujoco")
+    theirs.reset(seed=0)
+    timestep = jax.jit(ours.set_physics)(theirs.data.qpos, theirs.data.qvel)
+    assert ours.speed(timestep) == 0
+    step, generator = jax.jit(ours.step), np.random.default_rng(0)
+    low, high = theirs.model.actuator_ctrlrange.T
+    for _ in range(3):
+        action = generator.uniform(-1, 1, theirs.model.nu)
+        x_velocity = theirs.step((low + high) / 2 + action * (high - low) / 2)[4]["x_velocity"]
+        timestep = step(timestep, jnp.float32(action))
+        assert not timestep.terminated and abs(x_velocity) > 1e-3
+        np.testing.assert_allclose(ours.speed(timestep), x_velocity, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["humanoid_standup", "humanoid_standup-v5"])
+def test_standing_up_has_no_speed(name):
+    assert envs.make(name, "mujoco").speed is None

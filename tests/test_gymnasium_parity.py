@@ -1,6 +1,6 @@
 """Our environments against Gymnasium's own, from the same states and actions.
 
-On MuJoCo C whole episodes are equal, to float32; on MJX single control steps are near (all tasks: `-m slow`).
+On MuJoCo C complete episodes are equal, to float32; on MJX single control steps are close (all tasks: `-m slow`).
 """
 
 import gymnasium
@@ -25,15 +25,15 @@ def name(request):
     return request.param
 
 
-# Whole episodes on MuJoCo C
+# Complete episodes on MuJoCo C
 
 
-# They observe what the humanoid does, or less: compiling that takes longest of all.
+# They observe the quantities of the humanoid, or some of them: these take the longest to compile.
 LARGE = ("humanoid", "humanoid_standup", "humanoid-v5", "humanoid_standup-v5", "ant-v5")
 
 
 @pytest.mark.parametrize("name", [pytest.param(t, marks=pytest.mark.slow) if t in LARGE else t for t in TASKS])
-def test_whole_episodes_on_mujoco_are_gymnasiums(name):
+def test_complete_episodes_on_mujoco_are_gymnasiums(name):
     """Actions of all sizes, and small ones, with which more robots stay healthy for long."""
     found = compare_episodes(envs.make(name, "mujoco"), [episode(name, *case) for case in EPISODES])
     assert found.obs <= 1e-5 and found.reward <= 1e-5  # |error| <= 1e-5 + 1e-5 |x|

@@ -31,8 +31,8 @@ def transitions(ids) -> Transition:
 
 
 @cache
-def compiled(num_envs=1, capacity=CAPACITY, batch=BATCH, shortest_episode=1):
-    ring = Ring(capacity, O, A, num_envs, shortest_episode)
+def compiled(num_envs=1, capacity=CAPACITY, batch=BATCH, min_mean_episode_length=1):
+    ring = Ring(capacity, O, A, num_envs, min_mean_episode_length)
     buffer = lap.lap(ring, batch, EXPONENT, MIN_PRIORITY, REFRESH)
     return buffer.init, jax.jit(buffer.insert), jax.jit(buffer.sample), jax.jit(buffer.feedback)
 
@@ -311,7 +311,7 @@ def test_a_row_that_is_overwritten_loses_its_old_priority():
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
     """Every episode is one step, and there is room for those of a tenth of the rows."""
-    init, insert, *_ = compiled(num_envs, capacity=40, shortest_episode=10)
+    init, insert, *_ = compiled(num_envs, capacity=40, min_mean_episode_length=10)
     state, room = init(), 4 + num_envs
     for step in range(1, 60 // num_envs):
         state = insert(state, transitions(1 + step * 10 + np.arange(num_envs)))
@@ -321,7 +321,9 @@ def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
         expected[newest % 40] = 1
         assert_levels_agree(state.levels, expected)
     gone = np.flatnonzero(expected == 0)[:BATCH]
-    after = compiled(num_envs, capacity=40, shortest_episode=10)[3](state, gone, np.full(BATCH, 32.0), jnp.int32(1))
+    after = compiled(num_envs, capacity=40, min_mean_episode_length=10)[3](
+        state, gone, np.full(BATCH, 32.0), jnp.int32(1)
+    )
     assert_levels_agree(after.levels, expected)  # also of one that was lost since it was drawn
 
 
@@ -332,7 +334,7 @@ MEMBERS = 3
 
 def training_loop(capacity):
     """Insert, sample and feedback of a sweep's members in a loop, compiled as in the training program."""
-    buffer = lap.lap(Ring(capacity, O, A, shortest_episode=8), 64)
+    buffer = lap.lap(Ring(capacity, O, A, min_mean_episode_length=8), 64)
     axes = member_axes(jax.eval_shape(buffer.init))
     insert = jax.vmap(buffer.insert, in_axes=(axes, 0), out_axes=axes)
     sample = jax.vmap(buffer.sample, in_axes=(axes, 0))
@@ -360,7 +362,7 @@ def loops():
 
 def held_shapes(state):
     """What grows with the capacity, as the compiled text writes it."""
-    arrays = state.rows.storage, *state.levels[:-1], state.rows.finals, state.rows.owners
+    arrays = state.rows.storage, *state.levels[:-1], state.rows.final_obs, state.rows.final_owner
     kinds = {"float32": "f32", "int32": "s32"}
     return [f"{kinds[leaf.dtype.name]}[{','.join(map(str, leaf.shape))}]" for leaf in arrays]
 

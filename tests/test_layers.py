@@ -10,8 +10,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # From the ground up; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
-    {"sqt_jax.types", "sqt_jax.names"},
-    {"sqt_jax.cores", "sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
+    {"sqt_jax.types", "sqt_jax.suggestions"},
+    {"sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
     {
         "sqt_jax.config",
         "sqt_jax.q_targets",

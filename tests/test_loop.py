@@ -43,7 +43,8 @@ class Recorder:
 
     def evaluate(self, state):
         self.now += 0.5
-        evaluation = Evaluation(np.array([[self.done, self.done + 2], [0.0, 0.0]]), np.full((2, 2), 10))
+        returns = np.array([[self.done, self.done + 2], [0.0, 0.0]])
+        evaluation = Evaluation(returns, lengths=np.full((2, 2), 10), speeds=np.full((2, 2), np.nan))
         return evaluation, {"value_bias": np.array([1.5, -2.5])}
 
     def run(self, stop=lambda: False, **options):

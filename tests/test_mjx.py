@@ -1,4 +1,4 @@
-"""The MJX simulator; its agreement with MuJoCo C over whole tasks is in test_gymnasium_parity."""
+"""The physics `mjx`; its agreement with MuJoCo C on the tasks is in test_gymnasium_parity."""
 
 from importlib.metadata import version
 
@@ -99,8 +99,8 @@ def test_models_own_solver_settings_are_reachable_and_give_the_same_step():
 
 
 @pytest.mark.parametrize("name", ["iterations", "ls_iterations"])
-def test_a_solver_without_steps_is_refused(name):
-    with pytest.raises(ValueError, match=f"{name}: expects a whole number of at least 1, .* not 0"):
+def test_a_solver_without_steps_is_rejected(name):
+    with pytest.raises(ValueError, match=f"{name}: expected a whole number of at least 1, .* got 0"):
         envs.make("ant", **{name: 0})
 
 
@@ -126,7 +126,7 @@ def solver_settings(options, monkeypatch):
     return seen[0].opt.iterations, seen[0].opt.ls_iterations
 
 
-def test_unknown_options_and_integrators_are_refused():
+def test_unknown_options_and_integrators_are_rejected():
     with pytest.raises(TypeError, match="iteration"):
         envs.make("cheetah", iteration=3)
     with pytest.raises(ValueError, match="IMPLICITFAST"):

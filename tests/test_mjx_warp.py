@@ -11,7 +11,7 @@ from experiments.parity import compare_steps  # noqa: E402
 from sqt_jax import envs  # noqa: E402
 from sqt_jax.envs import physics  # noqa: E402
 
-pytestmark = pytest.mark.slow  # Warp compiles each kernel by itself
+pytestmark = pytest.mark.slow  # Warp compiles each kernel separately
 
 
 @pytest.fixture(autouse=True)

@@ -1,11 +1,6 @@
-"""MuJoCo C inside compiled programs; that whole episodes are Gymnasium's is in test_gymnasium_parity."""
+"""MuJoCo C inside compiled programs; complete episodes are compared with Gymnasium in test_gymnasium_parity."""
 
 import concurrent.futures
-import itertools
-import os
-import signal
-import threading
-import time
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +11,7 @@ import pytest
 from sqt_jax import envs
 from sqt_jax.envs import gym_tasks
 from sqt_jax.envs.gym_table import TASKS
-from sqt_jax.envs.physics import Setup, mujoco_c
+from sqt_jax.envs.physics import Setup, mujoco_c, threads
 
 
 def setup_of(name):
@@ -164,80 +159,24 @@ def test_programs_in_several_threads_do_not_disturb_each_other(ant, count):
     physics, model, advance = ant
     state, control = robots(physics, model, count)
     expected = advance(state, control)
-    mujoco_c._pools.clear()  # all of them ask for a pool at once
+    threads._pools.clear()  # so that all of them make a pool at the same time
     fresh = mujoco_c.make(setup_of("ant"), num_threads=2)
     step = jax.jit(jax.vmap(fresh.advance))
     with concurrent.futures.ThreadPoolExecutor(8) as pool:
         results = list(pool.map(lambda _: jax.block_until_ready(step(state, control)), range(40)))
     assert all(same(result, expected) for result in results)
-    assert len(mujoco_c._pools) == (count > 1)
+    assert len(threads._pools) == (count > 1)
 
 
-def numbered(work):
-    """`work(number)` as what a pool runs; the caller's own number is 0."""
-    helpers = itertools.count(1)
-    return lambda: work(0 if threading.current_thread() is threading.main_thread() else next(helpers))
-
-
-def test_an_interrupt_waits_for_the_threads():
-    """Ctrl-C while the helpers still work: it is raised, but not before they have ended."""
-    ended = []
-
-    def work(number):
-        time.sleep(0.02 if number == 0 else 0.3)
-        ended.append(number)
-
-    def interrupt(number, frame):
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, 0.1)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            mujoco_c._threads(3).run(numbered(work), 3)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    assert sorted(ended) == [0, 1, 2]
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*")
-def test_a_forked_child_has_threads_of_its_own():
-    mujoco_c._threads(3).run(lambda: None, 3)
-    child = os.fork()
-    if child == 0:
-        signal.alarm(20)  # else a child that waits for its parent's threads would wait forever
-        seen = []
-        mujoco_c._threads(3).run(numbered(seen.append), 3)
-        os._exit(0 if sorted(seen) == [0, 1, 2] else 1)
-    assert os.waitpid(child, 0)[1] == 0
-
-
-def test_no_threads_are_refused():
-    with pytest.raises(ValueError, match="num_threads expects at least 1, not 0"):
+def test_no_threads_are_rejected():
+    with pytest.raises(ValueError, match="num_threads: expected a whole number of at least 1, got 0"):
         mujoco_c.make(setup_of("ant"), num_threads=0)
 
 
-def test_an_error_in_a_thread_is_raised_once_all_have_ended():
-    ended = []
-
-    def work(number):
-        if number == 1:
-            raise RuntimeError("broken")
-        ended.append(number)
-
-    threads = mujoco_c._threads(3)
-    with pytest.raises(RuntimeError, match="broken"):
-        threads.run(numbered(work), 3)
-    assert sorted(ended) == [0, 2]
-    threads.run(numbered(ended.append), 3)  # and they go on working
-    assert sorted(ended) == [0, 0, 1, 2, 2]
-
-
-def test_activation_states_are_refused():
+def test_activation_states_are_rejected():
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody><actuator>"
         "<general joint='j' dyntype='integrator'/></actuator></mujoco>"
     )
-    with pytest.raises(ValueError, match="1 activation states"):
+    with pytest.raises(ValueError, match="expected no activation states, got 1"):
         mujoco_c.make(Setup(model, 1))

@@ -1,4 +1,4 @@
-"""Which simulators there are, and which of them can run here."""
+"""The table of physics, and which of them can run on this machine."""
 
 import types
 
@@ -13,18 +13,18 @@ def gpu(version):
     return [types.SimpleNamespace(platform="gpu", client=types.SimpleNamespace(platform_version=version))]
 
 
-def test_every_simulator_is_a_module_that_can_be_found():
+def test_every_physics_is_a_module_that_can_be_found():
     for module in physics.PHYSICS.values():
         assert physics.find_spec(module)
     assert physics.LACKS.keys() <= physics.PHYSICS.keys()
 
 
 @pytest.mark.parametrize("name", ["mjx", "mujoco", "spring"])
-def test_most_simulators_run_anywhere(name):
+def test_most_physics_run_anywhere(name):
     assert physics.lacks(name) == ""
 
 
-def test_warp_wants_its_package(monkeypatch):
+def test_warp_needs_its_package(monkeypatch):
     monkeypatch.setattr(physics, "find_spec", lambda name: None)
     assert physics.lacks("warp") == "the package warp-lang (pip install -e '.[warp]')"
 
@@ -38,13 +38,13 @@ def test_warp_wants_its_package(monkeypatch):
     ],
     ids=["cpu", "rocm", "cuda"],
 )
-def test_warp_wants_an_nvidia_gpu(monkeypatch, devices, missing):
+def test_warp_needs_an_nvidia_gpu(monkeypatch, devices, missing):
     monkeypatch.setattr(physics, "find_spec", lambda name: object())
     monkeypatch.setattr(jax, "devices", lambda: devices)
     assert physics.lacks("warp") == missing
 
 
-def test_what_cannot_run_is_refused_in_one_line(monkeypatch):
+def test_physics_that_cannot_run_is_rejected_in_one_line(monkeypatch):
     monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
     with pytest.raises(ValueError, match="^physics warp needs a part$"):
         envs.make("ant", "warp")

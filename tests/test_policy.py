@@ -1,4 +1,4 @@
-"""A saved policy acts as the agent that it was saved from, and loading refuses what does not fit."""
+"""A saved policy acts like the agent it was saved from; loading rejects files that are damaged or do not fit."""
 
 import json
 import os
@@ -42,12 +42,12 @@ def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
         np.testing.assert_allclose(policy.load_policy(tmp_path / "policy", member)(obs), expected, rtol=1e-5)
 
 
-def test_one_agents_state_without_an_axis_of_members_is_refused(tmp_path):
+def test_one_agents_state_without_an_axis_of_members_is_rejected(tmp_path):
     """Its first rows would be taken for members."""
     env = probe_envs.constant_reward()
     config = algorithms.make_config("td3", "cheetah", hidden=(8, 8))
     state = algorithms.agent_of(config, env).init(jax.random.key(1))
-    with pytest.raises(ValueError, match="td3's with a leading axis of members"):
+    with pytest.raises(ValueError, match="that of td3 with a leading axis of members"):
         policy.save_policy(tmp_path / "policy", config, env, state, members=1)
     assert not (tmp_path / "policy").exists()
     policy.save_policy(tmp_path / "policy", config, env, jax.tree.map(lambda leaf: leaf[None], state))
@@ -60,11 +60,11 @@ def test_an_existing_policy_is_not_overwritten(tmp_path):
         saved("td3", tmp_path / "policy")
 
 
-def test_parameters_of_other_sizes_are_refused(tmp_path):
+def test_parameters_of_other_sizes_are_rejected(tmp_path):
     saved("td3", tmp_path / "policy")
     path = tmp_path / "policy" / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"action_size": 3}))
-    with pytest.raises(ValueError, match="does not hold a policy"):
+    with pytest.raises(ValueError, match="does not have the parameters of a"):
         policy.load_policy(tmp_path / "policy")
 
 
@@ -74,7 +74,7 @@ def test_a_missing_member_is_named(tmp_path):
         policy.load_policy(tmp_path / "policy", member=7)
 
 
-# A folder that was made to do harm, or came to it. Damage expects the folder.
+# A folder made to do harm, or damaged. `damage` gets the folder.
 
 
 class Touch:
@@ -106,7 +106,7 @@ def without(key):
 
 
 def parameters(change, save=np.savez):
-    """`change` expects the arrays of member 0 by name, and gives others."""
+    """`change` gets the arrays of member 0 by name, and returns others."""
 
     def damage(folder):
         with np.load(folder / "member_0.npz") as file:
@@ -162,7 +162,11 @@ def a_pipe(folder):
     os.mkfifo(folder / "member_0.npz")
 
 
-NOT_SETTINGS, NOT_PARAMETERS, OTHER = "not the settings of", "not the parameters of", "does not hold a policy"
+NOT_SETTINGS, NOT_PARAMETERS, OTHER = (
+    "not the settings of",
+    "not the parameters of",
+    "does not have the parameters of a",
+)
 HOSTILE = {
     "config truncated": (cut("config.json", -20), NOT_SETTINGS),
     "config empty": (written("config.json", b""), NOT_SETTINGS),
@@ -218,7 +222,7 @@ def td3_policy(tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_a_hostile_folder_is_refused_in_one_line(td3_policy, tmp_path, monkeypatch, case):
+def test_a_hostile_folder_is_rejected_in_one_line(td3_policy, tmp_path, monkeypatch, case):
     damage, message = HOSTILE[case]
     folder = tmp_path / "policy"
     shutil.copytree(td3_policy, folder)

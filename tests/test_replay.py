@@ -19,8 +19,8 @@ CAPACITY = 6
 
 
 @cache
-def compiled(capacity=CAPACITY, batch=BATCH, shortest_episode=1):
-    buffer = replay.uniform(Ring(capacity, O, A, shortest_episode=shortest_episode), batch)
+def compiled(capacity=CAPACITY, batch=BATCH, min_mean_episode_length=1):
+    buffer = replay.uniform(Ring(capacity, O, A, min_mean_episode_length=min_mean_episode_length), batch)
     return buffer.init, jax.jit(buffer.insert), jax.jit(buffer.sample)
 
 
@@ -42,7 +42,9 @@ def test_sampling_is_uniform_over_the_newest_transitions(rows):
 
 
 def test_a_transition_that_lost_its_final_observation_is_not_sampled_nor_are_older_ones():
-    init, insert, sample = compiled(capacity=8, batch=8000, shortest_episode=8)  # room for two final observations
+    init, insert, sample = compiled(
+        capacity=8, batch=8000, min_mean_episode_length=8
+    )  # room for two final observations
     state, stream = filled(init, insert, [True, False, True, True, False, False, True, False])
     # Number 0's went for number 3's, number 2's for number 6's.
     rewards, counts = np.unique(sample(state, jax.random.key(0))[0].reward, return_counts=True)

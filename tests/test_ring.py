@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sqt_jax import replay
-from sqt_jax.members import member_axes
 from sqt_jax.ring import Ring
 from sqt_jax.types import Transition
 
@@ -50,8 +49,8 @@ class Stream:
 
 
 @cache
-def compiled(num_envs=1, shortest_episode=1, capacity=CAPACITY):
-    ring = Ring(capacity, O, A, num_envs, shortest_episode)
+def compiled(num_envs=1, min_mean_episode_length=1, capacity=CAPACITY):
+    ring = Ring(capacity, O, A, num_envs, min_mean_episode_length)
     return ring, jax.jit(ring.insert), jax.jit(ring.read)
 
 
@@ -120,17 +119,17 @@ def test_where_episodes_are_shorter_than_was_said_old_transitions_go_and_none_is
     assert numbers.start == max(15 * num_envs - CAPACITY, max(lost, default=-1) + 1)
     # Ends that the newest step made are not written yet.
     later = ends.ravel()[: 14 * num_envs]
-    kept = np.flatnonzero(later)[-ring.finals :]
-    assert state.ended == later.sum()
-    assert sorted(np.asarray(state.owners)[np.asarray(state.owners) >= 0]) == kept.tolist()
-    assert numbers.start <= max(15 * num_envs - CAPACITY, kept[0] if len(kept) == ring.finals else 0)
+    kept = np.flatnonzero(later)[-ring.final_capacity :]
+    assert state.num_finals == later.sum()
+    assert sorted(np.asarray(state.final_owner)[np.asarray(state.final_owner) >= 0]) == kept.tolist()
+    assert numbers.start <= max(15 * num_envs - CAPACITY, kept[0] if len(kept) == ring.final_capacity else 0)
 
 
 def test_room_for_final_observations_is_as_the_episodes_need_it():
-    assert Ring(1000, O, A).finals == 1001
-    assert Ring(1_000_000, O, A, shortest_episode=1000).finals == 1001
-    assert Ring(1000, O, A, num_envs=8, shortest_episode=8).finals == 133
-    assert Ring(2**30, O, A).finals == 2**24  # whose numbers float32 can tell apart
+    assert Ring(1000, O, A).final_capacity == 1001
+    assert Ring(1_000_000, O, A, min_mean_episode_length=1000).final_capacity == 1001
+    assert Ring(1000, O, A, num_envs=8, min_mean_episode_length=8).final_capacity == 133
+    assert Ring(2**30, O, A).final_capacity == 2**24  # whose numbers float32 can tell apart
 
 
 def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
@@ -140,31 +139,56 @@ def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
     one = jax.tree.map(np.float32, one)
     for _ in range(3):
         state, _ = insert(state, one)
-    assert state.ended == 0
+    assert state.num_finals == 0
     assert_same(read(state, jnp.array([1])), one)
 
 
 @pytest.mark.parametrize("width", [1, 3, 4])
-def test_other_than_one_transition_per_environment_is_refused(width):
+def test_other_than_one_transition_per_environment_is_rejected(width):
     ring = Ring(CAPACITY, O, A, num_envs=2)
-    with pytest.raises(ValueError, match=r"expects transitions of {'obs': \(2, "):
+    with pytest.raises(ValueError, match=r"expected transitions of {'obs': \(2, "):
         ring.insert(ring.init(), Stream(width).step(np.zeros(width, bool)))
 
 
 @pytest.mark.parametrize("field", Transition._fields)
-def test_transitions_of_other_sizes_are_refused(field):
+def test_transitions_of_other_sizes_are_rejected(field):
     """A narrower row would be written without complaint, its columns one place too early."""
     ring, one = Ring(CAPACITY, O, A), Stream(1).step(np.zeros(1, bool))
     ring.insert(ring.init(), one)
     narrow = one._replace(**{field: getattr(one, field)[..., :0] if field in ("obs", "action", "next_obs") else 0.0})
-    with pytest.raises(ValueError, match=rf"expects transitions of .*, not .*'{field}': \("):
+    with pytest.raises(ValueError, match=rf"expected transitions of .*, got .*'{field}': \("):
         ring.insert(ring.init(), narrow)
 
 
 @pytest.mark.parametrize("capacity", [0, 1, 3, 13])
-def test_a_capacity_that_an_insert_could_straddle_is_refused(capacity):
+def test_a_capacity_that_an_insert_could_straddle_is_rejected(capacity):
     with pytest.raises(ValueError, match=f"capacity .{capacity}. must be a multiple of the rows inserted at once .2."):
         Ring(capacity, O, A, num_envs=2).init()
+
+
+# Members of a sweep
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_members_have_their_own_of_every_field_except_the_number_of_inserted_transitions(num_envs):
+    """Two members, one whose episodes end at every step and one whose never do: as each would be without the other."""
+    ring = Ring(CAPACITY, O, A, num_envs, min_mean_episode_length=4)
+    axes = ring.member_axes()
+    assert axes.inserted is None and set(axes._replace(inserted=0)) == {0}
+    streams, alone = (Stream(num_envs), Stream(num_envs)), [ring.init(), ring.init()]
+    together = jax.vmap(lambda _: ring.init(), out_axes=axes)(jnp.arange(2))
+    insert = jax.jit(jax.vmap(ring.insert, (axes, 0), (axes, 0)))
+    for _ in range(CAPACITY + 3):
+        steps = [stream.step(np.full(num_envs, ends)) for stream, ends in zip(streams, (True, False), strict=True)]
+        together, _ = insert(together, jax.tree.map(lambda *leaves: np.stack(leaves), *steps))
+        alone = [ring.insert(state, step)[0] for state, step in zip(alone, steps, strict=True)]
+    assert together.inserted.shape == () and together.num_finals.tolist() == [num_envs * (CAPACITY + 2), 0]
+    for member, state in enumerate(alone):
+        of_member = jax.tree.map(
+            lambda leaf, m=member: leaf[m], together._replace(inserted=jnp.stack([together.inserted] * 2))
+        )
+        for name, a, b in zip(state._fields, of_member, state, strict=True):
+            np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 # What checkpoints hold
@@ -191,12 +215,14 @@ def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, ste
             written = int(state.inserted)
     for number in range(written, int(state.inserted)):
         kept.append(np.asarray(one_row(ring, state, number % CAPACITY)))
-    back = ring.without_rows(state)._replace(storage=jnp.zeros_like(state.storage), finals=jnp.zeros_like(state.finals))
+    back = ring.without_rows(state)._replace(
+        storage=jnp.zeros_like(state.storage), final_obs=jnp.zeros_like(state.final_obs)
+    )
     # In pieces that end where the ring does, and older ones first.
     for start in range(0, len(kept), CAPACITY):
         back = ring.with_rows(back, jnp.concatenate(kept[start : start + CAPACITY]), 0)
     numbers, held = readable(ring, read, back)
-    assert len(numbers) >= min(int(state.inserted), CAPACITY, num_envs + ring.finals)
+    assert len(numbers) >= min(int(state.inserted), CAPACITY, num_envs + ring.final_capacity)
     for number, transition in zip(numbers, held, strict=True):
         assert_same(transition, stream.transitions[number])
     more = stream.step(np.ones(num_envs, bool))
@@ -205,10 +231,10 @@ def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, ste
 
 
 def test_without_rows_leaves_what_is_small():
-    ring = Ring(10_000, O, A, shortest_episode=1000)
+    ring = Ring(10_000, O, A, min_mean_episode_length=1000)
     state = ring.init()
     rest = ring.without_rows(state)
-    assert rest.storage is rest.finals is None
+    assert rest.storage is rest.final_obs is None
     assert sum(leaf.nbytes for leaf in jax.tree.leaves(rest)) < 0.001 * state.storage.nbytes
 
 
@@ -223,7 +249,7 @@ def insert_alone(ring):
 
 def insert_of_members(ring, members=5):
     """As in a sweep: arrays with a member axis, the counter without."""
-    axes = member_axes(jax.eval_shape(ring.init))
+    axes = ring.member_axes()
     insert = jax.vmap(insert_alone(ring)[0], in_axes=(axes, 0), out_axes=axes)
     init = jax.vmap(lambda _: ring.init(), out_axes=axes)
     return insert, jax.eval_shape(init, jnp.arange(members)), (members,)
@@ -232,7 +258,7 @@ def insert_of_members(ring, members=5):
 def loop_of_members(ring, members=5):
     """As in the training program: inserts and samples in a loop."""
     insert, state, leading = insert_of_members(ring, members)
-    sample = jax.vmap(replay.uniform(ring, BATCH).sample, in_axes=(member_axes(state), 0))
+    sample = jax.vmap(replay.uniform(ring, BATCH).sample, in_axes=(ring.member_axes(), 0))
 
     def loop(state, transition):
         def body(i, carry):
@@ -254,11 +280,11 @@ PROGRAMS = [insert_alone, insert_of_members, loop_of_members, partial(loop_of_me
 def test_an_insert_writes_in_place_whatever_the_capacity(program, num_envs):
     scratch = {}
     for capacity in (10_000, 1_000_000):
-        insert, state, leading = program(Ring(capacity, O, A, num_envs, shortest_episode=8))
+        insert, state, leading = program(Ring(capacity, O, A, num_envs, min_mean_episode_length=8))
         step = Stream(num_envs).step(np.zeros(num_envs, bool))
         one = Transition(*(jnp.zeros((*leading, *leaf.shape)) for leaf in step))
         executable = jax.jit(insert, donate_argnums=0).lower(state, one).compile()
-        for array, kind in ((state.storage, "f32"), (state.finals, "f32"), (state.owners, "s32")):
+        for array, kind in ((state.storage, "f32"), (state.final_obs, "f32"), (state.final_owner, "s32")):
             shape = ",".join(map(str, array.shape))
             written = set(re.findall(rf"= {kind}\[{shape}\]\S* ([\w-]+)\(", executable.as_text()))
             assert written, f"{shape} is not in the compiled text"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import test_plan
 
-from sqt_jax.cores import usable_cores
+from sqt_jax.envs.physics.threads import usable_cores
 
 ROOT = Path(__file__).parents[1]
 PROGRAM = """

@@ -100,7 +100,7 @@ def test_diverged_physics_are_counted_and_never_reach_the_replay():
     np.testing.assert_array_equal(metrics["unstable_steps"], broken.sum(axis=1))
     np.testing.assert_array_equal(rows[..., 3], ~broken)  # the episode terminated
     np.testing.assert_array_equal(rows[..., 2], ~broken)  # with reward 0
-    last = np.asarray(state.replay.finals)[np.asarray(state.replay.owners) >= 0]
+    last = np.asarray(state.replay.final_obs)[np.asarray(state.replay.final_owner) >= 0]
     assert last.size and set(last.ravel()) <= set(rows[..., 0].ravel())  # this task's state never changes
     state, metrics = advance(sweep, state, 30, True)
     assert np.isfinite(metrics["critic_loss"]).all() and np.isfinite(state.replay.storage).all()

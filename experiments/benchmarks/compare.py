@@ -18,8 +18,8 @@ import jax
 
 from experiments.benchmarks.measure import Case, Failure, Made, Row, in_turns, loop_steps, updates
 from sqt_jax import envs
-from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table
+from sqt_jax.envs.physics.threads import usable_cores
 from sqt_jax.members import usable_devices
 
 PEERS = Path(__file__).parent / "peers"

@@ -22,8 +22,8 @@ from experiments.benchmarks import kernels, operations
 from experiments.benchmarks.timing import tried_in_turns
 from sqt_jax import algorithms, envs, lap, replay, rollout, train
 from sqt_jax.config import Config
-from sqt_jax.cores import usable_cores
 from sqt_jax.envs import gym_table, gym_tasks
+from sqt_jax.envs.physics.threads import usable_cores
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.ring import Ring
 from sqt_jax.types import Array, Transition
@@ -299,7 +299,7 @@ def replay_case(kind: str, what: str, task: str, capacity: int, members: int) ->
 def replay_steps(kind: str, what: str, task: str, capacity: int, members: int) -> Callable[[int], Any]:
     """A number of inserts or samples -> what it waits for."""
     env = envs.make(task)
-    ring = Ring(capacity, env.observation_size, env.action_size, shortest_episode=env.shortest_episode)
+    ring = Ring(capacity, env.observation_size, env.action_size, min_mean_episode_length=env.min_mean_episode_length)
     store = REPLAYS[kind](ring, BATCH)
     axes = store.member_axes
     obs, action, scalar = jnp.ones((1, env.observation_size)), jnp.zeros((1, env.action_size)), jnp.ones(1)

@@ -18,8 +18,8 @@ from experiments.commandline.arguments import UsageError
 from experiments.commandline.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag, OutputConfig
 from experiments.commandline.presets import PRESETS
 from sqt_jax.config import SETTINGS
-from sqt_jax.names import nearest
 from sqt_jax.settings import ConfigError, Setting, settings_of
+from sqt_jax.suggestions import did_you_mean
 
 MAX_SEED = 2**32 - 1
 MAX_MEMBERS = 10_000
@@ -81,7 +81,7 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     try:
         rest = values(_with_resume_valued(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
-        hint = nearest(f"--{error.flagname}", [f"--{flag.name}" for flag in known]) or "; --help lists the flags"
+        hint = did_you_mean(f"--{error.flagname}", [f"--{flag.name}" for flag in known]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
     except (absl_flags.Error, ValueError) as error:
         text = str(error).removeprefix("flag ").removeprefix("ERROR:: ")

@@ -66,7 +66,7 @@ def task_sizes(collected: Collected) -> list[dict[str, Any]]:
 def _sizes(name: str) -> Mapping[str, Any]:
     from sqt_jax import envs  # brings JAX
 
-    env = envs.make(name, "mujoco" if "mujoco" in envs.simulators(name) else None)
+    env = envs.make(name, "mujoco" if "mujoco" in envs.physics_of(name) else None)
     task = envs.TASKS[name].gymnasium_id if name in envs.TASKS else f"Brax {name.partition(':')[2]}"
     sizes = {"observation": env.observation_size, "action": env.action_size, "episode_steps": env.episode_length}
     return {"env": name, "task": task} | sizes

@@ -28,7 +28,7 @@ class Report(NamedTuple):
     metrics: dict[str, np.ndarray]  # name -> [S], of the steps since the last report; empty at step 0
     returns: np.ndarray | None  # [S, episodes]; None where there was no evaluation
     lengths: np.ndarray | None  # [S, episodes]
-    bias: dict[str, np.ndarray] = {}  # name -> [S], of `bias.Judgement`; empty where there was no evaluation
+    bias: dict[str, np.ndarray] = {}  # name -> [S], of `bias.BiasSums`; empty where there was no evaluation
 
 
 class Position(NamedTuple):

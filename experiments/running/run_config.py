@@ -104,7 +104,7 @@ def read(path: Path) -> Described:
         train, rows = members[0].config.train, content["replay_rows"]
         if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
             raise NotDescribed(f"its {NAME} names a replay that cannot be (replay_rows)")
-        if content.get("evaluated_on") not in (None, *envs.simulators(members[0].config.env)):
+        if content.get("evaluated_on") not in (None, *envs.physics_of(members[0].config.env)):
             raise NotDescribed(f"its {NAME} names a physics that cannot be (evaluated_on)")
     except OSError as error:
         raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None

@@ -4,7 +4,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from sqt_jax.cores import usable_cores
+from sqt_jax.envs.physics.threads import usable_cores
 
 # XLA's CPU backend compiles loops over little data into one function each. Its own limit leaves MJX's solver loops out,
 # whose many small kernels are then dispatched one by one.

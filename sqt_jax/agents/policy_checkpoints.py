@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.conditional import rarely
+from sqt_jax.conditional import cond_if_any
 from sqt_jax.config import AgentConfig
 from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, State, Transition, Views
 
@@ -68,7 +68,7 @@ def assess(
         return learner, jax.tree.map(lambda a, b: jnp.where(better, a, b), snapshot, checkpoint)
 
     # Complete networks, and once in an episode: not worth a selection at each step.
-    snapshot, checkpoint = rarely(over, refresh, (state.snapshot, state.checkpoint), given=(learner, better))
+    snapshot, checkpoint = cond_if_any(over, refresh, (state.snapshot, state.checkpoint), given=(learner, better))
     return PolicyCheckpoints(
         snapshot=snapshot,
         checkpoint=checkpoint,

@@ -1,4 +1,7 @@
-"""Environments by name: `make("ant")`, `make("humanoid-v5", "mujoco")`, `make("brax:ant", "spring")`."""
+"""Environments by name: `make("ant")`, `make("humanoid-v5", "mujoco")`, `make("brax:ant", "spring")`.
+
+To make an environment of your own: `sqt_jax.envs.autoreset.make_environment`.
+"""
 
 from typing import Any
 
@@ -6,45 +9,48 @@ from sqt_jax.envs import brax_envs, gym_table
 from sqt_jax.envs.gym_table import ALIASES, TASKS
 from sqt_jax.envs.gym_tasks import make_task
 from sqt_jax.envs.physics import PHYSICS, lacks
-from sqt_jax.names import unknown
+from sqt_jax.suggestions import expects_one_of
 from sqt_jax.types import Environment
 
-__all__ = ["ALIASES", "PHYSICS", "TASKS", "lacks", "make", "resolve", "simulators"]
+__all__ = ["ALIASES", "PHYSICS", "TASKS", "lacks", "make", "physics_of", "resolve"]
 
 
 def resolve(name: str) -> str:
-    """The table's name for a task's name, alias or Gymnasium id: `ant`, `ant-v5`, `walker2d`, `HalfCheetah-v4`.
+    """The canonical name of an environment: of an alias (`walker2d`) or a Gymnasium id (`ant-v5`, `HalfCheetah-v4`).
 
     Raises:
-      ValueError: the name is unknown; the message has the list of names and the nearest one.
+      ValueError: the name is unknown; the message lists the known names and suggests the nearest.
     """
     if name in brax_envs.NAMES:
         return name
     found = gym_table.versioned(name)
     if found not in TASKS:
-        raise ValueError(unknown(name, [*TASKS, *ALIASES, *brax_envs.NAMES]))
+        raise ValueError(expects_one_of(name, [*TASKS, *ALIASES, *brax_envs.NAMES]))
     return found
 
 
-def simulators(name: str) -> tuple[str, ...]:
-    """The physics that can compute an environment, by its own name; the first is the default."""
-    return brax_envs.pipelines(name) if name in brax_envs.NAMES else tuple(PHYSICS)
+def physics_of(name: str) -> tuple[str, ...]:
+    """The names of the physics that an environment (by its canonical name) can run on; the first is the default."""
+    return brax_envs.physics_of(name) if name in brax_envs.NAMES else tuple(PHYSICS)
 
 
 def make(name: str, physics: str | None = None, **options: Any) -> Environment:
-    """Make the environment `name` (an alias of it, or a Gymnasium id) on a simulator, with that simulator's options.
+    """Make an environment by its name, alias or Gymnasium id.
 
-    Without `physics`, on the first of its `simulators`. Options are, of mjx and warp, `iterations` and `ls_iterations`
-    (most steps of the constraint solver and of its line search, None: the model file's); of mujoco `num_threads`.
+    Args:
+      name: see `resolve`.
+      physics: one of `physics_of(name)`; None is the first of them.
+      **options: of the physics. mjx and warp: `iterations` and `ls_iterations`, the maximum steps of the constraint
+        solver and of its line search (None: the model file's). mujoco: `num_threads`. Brax's have none.
 
     Raises:
-      ValueError: the environment or the simulator is unknown, or the simulator cannot run here (`lacks`).
-      TypeError: the simulator has no such option.
+      ValueError: the environment or the physics is unknown, or the physics cannot run on this machine (`lacks`).
+      TypeError: the physics has no such option.
     """
     name = resolve(name)
-    physics = physics or simulators(name)[0]
-    if physics not in simulators(name):
-        raise ValueError("physics " + unknown(physics, simulators(name)))
+    physics = physics or physics_of(name)[0]
+    if physics not in physics_of(name):
+        raise ValueError("physics: " + expects_one_of(physics, physics_of(name)))
     if name in brax_envs.NAMES:
         return brax_envs.make_brax(name, physics, **options)
     return make_task(name, physics, **options)

@@ -1,17 +1,22 @@
-"""Episodes: the time limit, the automatic restart and the terminal contract, written once for every task.
+"""Episodes for every task: the time limit, the automatic reset and the terminal contract.
 
-The contract (one test per sentence in tests/test_envs.py):
+`make_environment` is the way to an environment of your own: its docstring is the guide.
+
+The contract of the environments it makes (one test per sentence in tests/test_autoreset.py):
 
 - `reset` and `step` are pure; the same key and the same actions give the same episode.
 - Actions are clipped to [-1, 1].
-- `reward`, `terminated` and `truncated` belong to the step that was just made, also where it ended the episode.
-- `truncated` is true at step `episode_length` of an episode and at no other. A step may be both terminated and
-  truncated, as in Gymnasium; there is no value beyond a terminated step, so `discount = 1 - terminated`.
-- After an ended episode `obs` and `state` are those of a new episode with a new random start, and `final_obs` is the
-  true last observation of the old one. Elsewhere `final_obs` equals `obs`.
-- A step whose reward or observation is not finite, or beyond 1e10 (diverged physics), ends the episode as terminated
-  with reward 0; its `final_obs` is the observation before it, so that nothing that is not finite leaves an environment.
-- `status` counts such steps, as `unstable_steps`.
+- `reward`, `terminated` and `truncated` belong to the step just made, also if it ended the episode.
+- `truncated` is true at step `episode_length` of an episode and at no other.
+- A step may be both terminated and truncated, as in Gymnasium; a terminated step has no value beyond it, so `discount
+  = 1 - terminated`.
+- After the end of an episode, `obs` and `state` are those of a new episode with a new random start, and `final_obs` is
+  the true last observation of the old one.
+- Elsewhere `final_obs` equals `obs`.
+- A step whose reward or observation is not finite, or beyond 1e10 (the physics diverged), ends the episode: terminated,
+  reward 0, and `final_obs` is the observation before it, so that every output stays finite.
+- `status` counts these steps, over all episodes, as `unstable_steps`.
+- `speed` is that of the step just made; after the end of an episode, that of the new start.
 """
 
 from collections.abc import Callable
@@ -21,13 +26,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sqt_jax.conditional import rarely
+from sqt_jax.conditional import cond_if_any
 from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
 
 LARGEST = 1e10  # MuJoCo's own limit (mjMAXVAL): beyond it, a simulation has diverged
-# Fewer steps than a robot that may fall needs for it: by the worst constant action at their limits, hopper and walker
-# do in six (tests/test_gym_tasks.py).
-SHORTEST_FALL = 5
+# A lower bound on the mean length of an episode that ends by a fall, in steps: under the worst constant action, hopper
+# and walker fall after six (tests/test_gym_tasks.py).
+MIN_STEPS_TO_FALL = 5
 
 Start = Callable[[Array], tuple[State, Array]]
 Advance = Callable[[State, Array], tuple[State, Array, Array, Array]]
@@ -37,10 +42,10 @@ Place = Callable[[Array, Array], tuple[State, Array]]
 class Episode(NamedTuple):
     """The state of an environment inside a `TimeStep`."""
 
-    task: State  # what the task's own functions carry (for the Gymnasium tasks: a `PhysicsState`)
+    task: State  # the state of `start` and `advance` (for the Gymnasium tasks: a `PhysicsState`)
     steps: Array  # [] int32: steps made in this episode
-    key: Array  # [] typed key: draws the starts of the episodes after this one
-    unstable: Array  # [] int32: steps so far, of all episodes, in which the physics diverged
+    key: Array  # [] typed key: draws the starts of the next episodes
+    unstable: Array  # [] int32: steps so far, over all episodes, in which the physics diverged
 
 
 def make_environment(
@@ -51,17 +56,47 @@ def make_environment(
     start: Start,
     advance: Advance,
     place: Place | None = None,
-    shortest_episode: int = 1,
+    min_mean_episode_length: int = 1,
+    speed: Callable[[State], Array] | None = None,
 ) -> Environment:
-    """Make an `Environment` out of a task that knows nothing of episodes.
+    """Make an `Environment` from two functions of one robot or task: how an episode starts, and one step.
+
+    A point on a line that earns more the closer it is to 0, and falls off at 2:
+
+    >>> def start(key):
+    ...     x = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
+    ...     return x, x  # the state and the observation
+    >>> def advance(x, action):
+    ...     x = x + 0.1 * action
+    ...     return x, x, -jnp.abs(x[0]), jnp.abs(x[0]) > 2.0
+    >>> env = make_environment("point", 1, 1, 200, start, advance)
+
+    `start` and `advance` are JAX code for a single environment, without a batch axis: training calls them under `jit`
+    and `vmap`. They know nothing of episodes: `make_environment` adds the time limit, clips actions to [-1, 1] and ends
+    an episode whose numbers are no longer finite. After each end it calls `start` again (the auto-reset): the time step
+    then has the state and `obs` of the new episode, and the old one's last observation as `final_obs`.
+
+    What they must not do: have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
+    key in the state and split it), branch in Python on a traced value, count the time limit, or start a new episode
+    themselves. The state is any tree of arrays; it must have the same structure, shapes and dtypes from both functions.
 
     Args:
-      start: `key -> (state, obs [O])`, a random start. Under `vmap` it runs for all at each step at which any episode
-        ends.
+      name: used in messages and records.
+      observation_size: O.
+      action_size: A.
+      episode_length: steps until the time limit truncates an episode.
+      start: `key -> (state, obs [O])`, a random start of an episode. Under `vmap` it runs for all environments at each
+        step at which any episode ends.
       advance: `(state, action [A] in [-1, 1]) -> (state, obs [O], reward [], terminated [] bool)`, one step.
-      place: `(qpos, qvel) -> (state, obs [O])`, a given physical state; gives `Environment.set_physics`, whose
-        episodes to come start from a fixed key.
-      shortest_episode: as in `Environment`.
+        `terminated` means that the task is over and there is no value beyond (a fall, a goal), not that time is up.
+      place: `(qpos [nq], qvel [nv]) -> (state, obs [O])`, a given physical state. It becomes
+        `Environment.set_physics`, whose later episodes start from a fixed key.
+      min_mean_episode_length: a memory hint, as in `Environment`; 1 is always safe.
+      speed: `state -> []`, the forward speed in m/s of the step that led to the state, shown in evaluations.
+
+    Returns:
+      The environment; what it promises is at the top of this module. It can be used in `sqt_jax.make_train(config,
+      env=env)`.
     """
 
     def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
@@ -70,18 +105,18 @@ def make_environment(
         episode = Episode(task, jnp.zeros((), jnp.int32), key, unstable)
         return TimeStep(episode, obs, jnp.zeros((), jnp.float32), no, no, obs)
 
-    none = np.zeros((), np.int32)
+    no_steps = np.zeros((), np.int32)
 
-    def fresh(key: Array, unstable: Array) -> TimeStep:
+    def new_episode(key: Array, unstable: Array) -> TimeStep:
         start_key, next_key = jax.random.split(key)
         return begin(*start(start_key), next_key, unstable)
 
     def reset(key: Array) -> TimeStep:
-        return fresh(key, jnp.asarray(none))
+        return new_episode(key, jnp.asarray(no_steps))
 
     def restart(old: tuple[Episode, Array], _: Any) -> tuple[State, Array]:
         episode, _ = old
-        first = fresh(episode.key, episode.unstable)
+        first = new_episode(episode.key, episode.unstable)
         return first.state, first.obs
 
     def step(timestep: TimeStep, action: Array) -> TimeStep:
@@ -97,17 +132,25 @@ def make_environment(
         truncated = steps >= episode_length
 
         ended = terminated | truncated
-        state, obs = rarely(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
+        state, obs = cond_if_any(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
         return TimeStep(state, obs, reward, terminated, truncated, final_obs)
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:
         assert place is not None
-        return begin(*place(qpos, qvel), jax.random.key(0), jnp.asarray(none))
+        return begin(*place(qpos, qvel), jax.random.key(0), jnp.asarray(no_steps))
 
     def status(timestep: TimeStep) -> Metrics:
         return {"unstable_steps": timestep.state.unstable}
 
-    given = set_physics if place else None
     return Environment(
-        name, observation_size, action_size, episode_length, reset, step, given, status, shortest_episode
+        name=name,
+        observation_size=observation_size,
+        action_size=action_size,
+        episode_length=episode_length,
+        reset=reset,
+        step=step,
+        set_physics=set_physics if place else None,
+        status=status,
+        min_mean_episode_length=min_mean_episode_length,
+        speed=(lambda timestep: speed(timestep.state.task)) if speed else None,
     )

@@ -1,7 +1,7 @@
-"""Brax's own environments, `brax:ant` and so on, through this repository's contract.
+"""Brax's own environments (`brax:ant`, ...), under this repository's episode contract (`autoreset`).
 
-Their observations and rewards are Brax's, not Gymnasium's. Brax's wrappers are not used: its automatic restart goes
-back to the first start and loses the last observation
+Their observations and rewards are Brax's, not Gymnasium's. Brax's wrappers are not used: their auto-reset returns to
+the first start and loses the last observation of an episode
 (https://github.com/google/brax/blob/main/brax/envs/wrappers/training.py).
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.envs.autoreset import SHORTEST_FALL, make_environment
+from sqt_jax.envs.autoreset import MIN_STEPS_TO_FALL, make_environment
 from sqt_jax.types import Array, Environment
 
 PREFIX = "brax:"
@@ -33,25 +33,25 @@ NAMES = tuple(
         "walker2d",
     )
 )
-PIPELINES = ("mjx", "generalized", "spring", "positional")
-ONLY = {"brax:swimmer": ("generalized",)}  # Brax gives it no others
+PHYSICS = ("mjx", "generalized", "spring", "positional")  # Brax's "backends"
+ONLY_PHYSICS = {"brax:swimmer": ("generalized",)}  # Brax's swimmer supports no other
 EPISODE_LENGTH = 1000  # as in Brax's training configurations
+# Tasks that terminate; the others never do.
 FALLING = {"brax:ant", "brax:hopper", "brax:humanoid", "brax:walker2d"}
-PENDULUMS = {"brax:inverted_pendulum", "brax:inverted_double_pendulum"}  # a push is enough: two steps
-# The other tasks never terminate.
+PENDULUMS = {"brax:inverted_pendulum", "brax:inverted_double_pendulum"}  # can fall within two steps
 
 
-def pipelines(name: str) -> tuple[str, ...]:
-    """What can compute the environment `name`; the first is the default."""
-    return ONLY.get(name, PIPELINES)
+def physics_of(name: str) -> tuple[str, ...]:
+    """The physics that the environment `name` (with its prefix) can run on; the first is the default."""
+    return ONLY_PHYSICS.get(name, PHYSICS)
 
 
 def make_brax(name: str, physics: str) -> Environment:
-    """The environment `name` (with its prefix) on one of its `pipelines`."""
+    """The environment `name` (with its prefix) on one of its `physics_of`. It has no `set_physics` and no `speed`."""
     env = brax_own(name, physics)
 
     def start(key: Array) -> tuple[Any, Array]:
-        with jax.default_matmul_precision("highest"):  # which GPUs do not give unasked
+        with jax.default_matmul_precision("highest"):  # GPUs would use TF32
             state = _strong(env.reset(key))
         return state, state.obs
 
@@ -60,20 +60,27 @@ def make_brax(name: str, physics: str) -> Environment:
             state = _strong(env.step(state, action))
         return state, state.obs, state.reward, state.done > 0
 
-    shortest = SHORTEST_FALL if name in FALLING else 1 if name in PENDULUMS else EPISODE_LENGTH
-    sizes = env.observation_size, env.action_size, EPISODE_LENGTH
-    return make_environment(name, *sizes, start, advance, shortest_episode=shortest)
+    shortest = MIN_STEPS_TO_FALL if name in FALLING else 1 if name in PENDULUMS else EPISODE_LENGTH
+    return make_environment(
+        name,
+        env.observation_size,
+        env.action_size,
+        EPISODE_LENGTH,
+        start,
+        advance,
+        min_mean_episode_length=shortest,
+    )
 
 
 def brax_own(name: str, physics: str) -> Any:
     """Brax's own object for the environment `name` (with its prefix): a `brax.envs.Env`."""
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that Brax's pipelines are no longer developed
+        warnings.simplefilter("ignore")  # Brax warns that its physics are no longer developed
         from brax import envs
 
         return envs.get_environment(name.removeprefix(PREFIX), backend=physics)
 
 
 def _strong(tree: Any) -> Any:
-    """Leaves with types of their own: a weak type would be another one to `jit`, which compiles for each."""
+    """The same leaves without weak types: `jit` would compile once for the weak and once for the strong type."""
     return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, jnp.result_type(leaf)), tree)

@@ -1,4 +1,4 @@
-"""The table of Gymnasium's locomotion tasks: what tells one from another, and their names.
+"""The table of Gymnasium's locomotion tasks: their constants and their names.
 
 Source: gymnasium/envs/mujoco/*_v4.py and *_v5.py, https://github.com/Farama-Foundation/Gymnasium.
 """
@@ -16,34 +16,34 @@ INF = float("inf")
 
 
 class Task(NamedTuple):
-    """One row of the table. A step's reward is `forward` × speed + `height` × z + `alive` - the two costs."""
+    """One task. The reward of a step is `forward` × speed + `height` × z + `alive` - control cost - contact cost."""
 
     gymnasium_id: str
     xml: str  # a file among gymnasium's assets
     frame_skip: int
     ctrl_cost: float  # per squared unit of control
     noise: float  # scale of the random start
-    normal_velocity: bool = False  # start velocities: normal with that scale, or uniform like the positions
-    tracked: Callable[[Any, Any], Any] | None = None  # the point whose speed along x is rewarded, as in `Setup`
+    normal_velocity: bool = False  # start velocities: normal, or uniform like the positions
+    tracked: Callable[[Any, Any], Any] | None = None  # as in `Setup`: the point whose speed along x is rewarded
     hidden: int = 1  # leading entries of qpos left out of the observation (x, or x and y)
     max_speed: float = INF  # observed velocities are clipped to it
     quantities: tuple[str, ...] = ()  # further fields that are observed, in this order
-    # v4 observes the world's (constant) entries of the quantities too, and the root's actuator forces.
+    # As in v4: the quantities' (constant) entries of the world body and the root's actuator forces are observed too.
     observes_world: bool = True
     forward: float = 1.0  # reward per m/s
     height: float = 0.0  # reward per m of z
     alive: float = 0.0  # reward per step
-    alive_at_end: bool = True  # also for the step that terminates, as in v4
+    alive_at_end: bool = True  # `alive` is also given for the step that terminates, as in v4
     contact_cost: float = 0.0  # per squared unit of external force
-    force_limit: float = INF  # each entry of the external forces is clipped to it, in observation and cost
+    force_limit: float = INF  # external forces are clipped to ± this, in observation and cost
     max_contact_cost: float = INF
     healthy: Callable[[Array, Array], Array] | None = None  # (qpos, qvel) -> bool; where false, the episode terminates
-    # Physics -> options that suit the task, where the physics' own defaults do not.
+    # Options for the physics of that name, where its defaults do not suit the task.
     options: Mapping[str, Mapping[str, int]] = MappingProxyType({})
 
 
 def _solver(iterations: int, ls_iterations: int = 3) -> Mapping[str, Mapping[str, int]]:
-    """The fewest steps of MJX's solver with which no control step is further from MuJoCo's (table: BUILD_NOTES.md)."""
+    """Options of MJX's solver: the fewest steps that lose no accuracy against MuJoCo (measured: BUILD_NOTES.md)."""
     return {"mjx": {"iterations": iterations, "ls_iterations": ls_iterations}}
 
 
@@ -101,7 +101,7 @@ V4 = {
     "swimmer": Task(
         "Swimmer-v4", "swimmer.xml", 4, ctrl_cost=1e-4, noise=0.1, hidden=2, options=_solver(4),
     ),
-    # The height is divided by the simulator's time step of 0.003 s.
+    # The height is divided by the physics' time step of 0.003 s.
     "humanoid_standup": Task(
         "HumanoidStandup-v4", "humanoidstandup.xml", 5, ctrl_cost=0.1, noise=1e-2,
         hidden=2, quantities=QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
@@ -140,7 +140,7 @@ ALIASES = {
 
 
 def versioned(name: str) -> str:
-    """What the table calls a name, alias or Gymnasium id, if it knows it: v4 has no suffix."""
+    """The name in `TASKS` of an alias or Gymnasium id (v4 has no suffix); of an unknown name, one not in `TASKS`."""
     base, dash, version = name.lower().partition("-v")
     base = ALIASES.get(base, base)
     return base if dash + version in ("", "-v4") else f"{base}-v{version}"

@@ -1,7 +1,7 @@
-"""MuJoCo XLA: the simulator in JAX, compiled together with the agent.
+"""Physics `mjx`: MuJoCo XLA, in JAX, compiled together with the agent (https://mujoco.readthedocs.io/en/stable/mjx.html).
 
-The state that is carried from step to step is small (positions, velocities, the solver's warm start, what is
-observed), because an automatic restart selects between two whole states: MJX's own `Data` is made anew inside a step.
+The state carried from step to step is small (positions, velocities, the solver's warm start, observed quantities),
+because an auto-reset selects between two states: MJX's large `Data` is made again inside each step.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that the pac
 from sqt_jax.envs.physics import Physics, PhysicsState, Setup
 from sqt_jax.types import Array
 
-# the classical Runge-Kutta method: where its four stages are evaluated, and their weights
+# The classical Runge-Kutta method: the times of its four stages, and their weights.
 _RK4_STAGE = np.array([0, 1 / 2, 1 / 2, 1], np.float32)
 _RK4_WEIGHT = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6], np.float32)
 
@@ -28,19 +28,20 @@ PRIVATE = ("cinert", "cfrc_ext")  # quantities that MJX 3.17 keeps under `data._
 
 
 def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8) -> Physics:
-    """MJX with Newton's method (it has no PGS, which the humanoid's file asks for).
+    """MJX with Newton's method (the humanoid's file specifies PGS, which MJX does not have).
 
     Args:
-      iterations: most steps of the constraint solver; None: the model file's. A control step with 8 is as near to
+      setup: the model and what the task needs.
+      iterations: maximum steps of the constraint solver; None: the model file's. A control step with 8 is as close to
         MuJoCo's as one with 100; some tasks need fewer (`Task.options`).
-      ls_iterations: most steps of its line search, which under `vmap` all cost time; None: the model file's.
+      ls_iterations: maximum steps of its line search; None: the model file's. Under `vmap` all of them are computed.
 
     Raises:
-      ValueError: the model has activation states, or an integrator other than Euler and RK4.
+      ValueError: the model has activation states, or an integrator other than Euler and RK4; a limit below 1.
     """
     host_model = newton_model(setup.model, iterations, ls_iterations)
     model = mjx.put_model(host_model, impl="jax")
-    # without implicit damping, an Euler step at no acceleration only moves the positions along the velocities
+    # Without implicit damping, an Euler step with zero acceleration only moves the positions along the velocities.
     host_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     drift_model = mjx.put_model(host_model, impl="jax")
 
@@ -57,7 +58,7 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
         return {name: getattr(data._impl if name in PRIVATE else data, name).reshape(-1) for name in names}
 
     def forward(state: PhysicsState, qpos: Array, qvel: Array, control: Array) -> tuple[mjx.Data, PhysicsState]:
-        """Evaluate the dynamics at (qpos, qvel); the state given back has not moved, but is measured there."""
+        """Evaluate the dynamics at (qpos, qvel); the returned state has not moved, but has the quantities there."""
         _, warm_start = state.internal
         data = _forward(model, data_at(qpos, qvel).replace(ctrl=control, qacc_warmstart=warm_start))
         if "cfrc_ext" in setup.quantities:
@@ -73,13 +74,13 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
         return state._replace(qpos=data.qpos, qvel=data.qvel, internal=(state.internal[0], data.qacc_warmstart))
 
     def rk4(state: PhysicsState, control: Array) -> PhysicsState:
-        # as mjx.rungekutta4, which unrolls the four stages and takes twice as long to compile
+        # The same as mjx.rungekutta4, which unrolls the four stages: that doubles the compile time.
         qpos, qvel = state.qpos, state.qvel
 
         def stage(i: Array, carry: tuple) -> tuple:
             state, velocity, acceleration, mean_velocity, mean_acceleration = carry
             part, weight = jnp.asarray(_RK4_STAGE)[i], jnp.asarray(_RK4_WEIGHT)[i]
-            at = jnp.where(i == 0, qpos, move(qpos, part * velocity))  # a move of 0 would still normalise quaternions
+            at = jnp.where(i == 0, qpos, move(qpos, part * velocity))  # even a move of 0 would normalise quaternions
             velocity = qvel + part * acceleration * model.opt.timestep
             data, state = forward(state, at, velocity, control)
             mean_velocity += weight * velocity
@@ -99,10 +100,16 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
     def place(qpos: Array, qvel: Array) -> PhysicsState:
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         with numerics():
-            # the part of `mjx.forward` that the measured quantities need; forces are zero before the first step
+            # The part of `mjx.forward` that the quantities need; forces are zero before the first step.
             data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data_at(qpos, qvel))))
             internal = (tracked(model, data), jnp.zeros(host_model.nv, jnp.float32))
-            return PhysicsState(qpos, qvel, jnp.zeros((), jnp.float32), quantities(data), internal)
+            return PhysicsState(
+                qpos=qpos,
+                qvel=qvel,
+                displacement=jnp.zeros((), jnp.float32),
+                quantities=quantities(data),
+                internal=internal,
+            )
 
     def advance(state: PhysicsState, control: Array) -> PhysicsState:
         control = jnp.asarray(control, jnp.float32)
@@ -115,18 +122,22 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
 
 
 def newton_model(model: mujoco.MjModel, iterations: int | None, ls_iterations: int | None) -> mujoco.MjModel:
-    """A copy of the model to be solved by Newton's method, with these limits; None leaves the model's own.
+    """A copy of the model, set to Newton's method with these maximum steps (None: the model's own).
 
     Raises:
       ValueError: the model has activation states, or an integrator other than Euler and RK4; a limit below 1.
     """
     for name, limit in {"iterations": iterations, "ls_iterations": ls_iterations}.items():
         if limit is not None and limit < 1:
-            raise ValueError(f"{name}: expects a whole number of at least 1, or None for the model file's, not {limit}")
+            raise ValueError(
+                f"{name}: expected a whole number of at least 1, or None for the model file's, got {limit}"
+            )
     model = copy.copy(model)
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if model.na or integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
-        raise ValueError(f"{integrator.name} with {model.na} activation states: only Euler and RK4 with none")
+        raise ValueError(
+            f"the model: expected Euler or RK4 without activation states, got {integrator.name} with {model.na} of them"
+        )
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     if iterations is not None:
         model.opt.iterations = iterations
@@ -144,11 +155,11 @@ def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Turn the frames of contacts between a plane and a capsule so that the first tangent lies along the capsule.
+    """Rotate the frames of plane-capsule contacts so that the first tangent is along the capsule.
 
-    MuJoCo does so always, MJX only where the capsule is less than 60 degrees from the plane
+    MuJoCo always does, MJX only if the capsule is less than 60 degrees from the plane
     (https://github.com/google-deepmind/mujoco/issues/2774). A pyramidal friction cone is not symmetric about its axis:
-    without this, one control step of the ant in ten is wrong by about 0.1 rad/s or more.
+    without this, one in ten of the ant's control steps is wrong by about 0.1 rad/s or more.
     """
     contact = data._impl.contact
     first, second = contact.geom.T
@@ -165,8 +176,8 @@ def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 @contextlib.contextmanager
 def numerics() -> Iterator[None]:
-    """Full precision, and implicit promotion as MJX relies on it, whatever the program around it allows."""
-    # "highest": GPUs would multiply matrices in TF32, with 10 bits of mantissa
+    """Full precision and the implicit promotions that MJX relies on, whatever the surrounding program sets."""
+    # "highest": GPUs would multiply matrices in TF32, with 10 bits of mantissa.
     with (
         jax.default_matmul_precision("highest"),
         jax.numpy_dtype_promotion("standard"),

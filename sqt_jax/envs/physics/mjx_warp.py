@@ -1,9 +1,9 @@
-"""MuJoCo Warp through MJX: the simulator as CUDA kernels, called from the compiled program.
+"""Physics `warp`: MuJoCo Warp through MJX, as CUDA kernels called from the compiled program.
 
-All robots of a program (members, environments) are one call, as one batch of worlds: Warp's contacts lie in one array
-for all of them, which has room for every pair of bodies that can touch, of every robot.
+All robots of a program (members, environments) are simulated in one call, as one batch of worlds. Warp keeps the
+contacts of all of them in one array, sized for every pair of bodies that can touch, of every robot.
 
-Needs the package warp-lang (the extra `warp`). Warp itself runs on a CPU too, slowly: good for tests.
+Needs the package warp-lang (the extra `warp`). Warp also runs on a CPU, slowly, which is good for tests.
 """
 
 from typing import Any
@@ -17,24 +17,25 @@ from sqt_jax.envs.physics.mjx import PRIVATE, mjx, newton_model, numerics
 from sqt_jax.envs.physics.mjx import make as make_mjx
 from sqt_jax.types import Array
 
-warp.config.log_level = warp.LOG_WARNING  # else it prints of each kernel that it compiles
+warp.config.log_level = warp.LOG_WARNING  # else it prints a line for each kernel it compiles
 
 
 def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None = None) -> Physics:
-    """MJX-Warp with Newton's method, started from MJX's kinematics.
+    """MJX-Warp with Newton's method; starts are placed by MJX's kinematics.
 
     Args:
-      iterations: most steps of the constraint solver, which stops where it has converged; None: the model file's.
-      ls_iterations: most steps of its line search; None: the model file's.
+      setup: the model and what the task needs.
+      iterations: maximum steps of the constraint solver, which stops when it converges; None: the model file's.
+      ls_iterations: maximum steps of its line search; None: the model file's.
 
     Raises:
-      ValueError: the model has activation states, or an integrator other than Euler and RK4.
+      ValueError: the model has activation states, or an integrator other than Euler and RK4; a limit below 1.
     """
     host_model = newton_model(setup.model, iterations, ls_iterations)
     model = mjx.put_model(host_model, impl="warp")
     if "cfrc_ext" in setup.quantities:
         model = model.tree_replace({"opt._impl.run_rne_postconstraint": True})
-    largest = mjx.make_data(host_model, impl="jax")._impl  # MJX's has a row for all that can ever touch
+    largest = mjx.make_data(host_model, impl="jax")._impl  # MJX's arrays have a row for everything that can touch
     num_contacts, num_rows = largest.contact.dist.shape[0], largest.efc_J.shape[0]
 
     def advance_one(blank: mjx.Data, state: PhysicsState, control: Array) -> PhysicsState:
@@ -45,7 +46,13 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
         quantities = {
             name: getattr(data._impl if name in PRIVATE else data, name).reshape(-1) for name in setup.quantities
         }
-        return PhysicsState(data.qpos, data.qvel, after - before, quantities, (after, data.qacc_warmstart))
+        return PhysicsState(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            displacement=after - before,
+            quantities=quantities,
+            internal=(after, data.qacc_warmstart),
+        )
 
     @jax.custom_batching.custom_vmap
     def advance_all(state: PhysicsState, control: Array) -> PhysicsState:
