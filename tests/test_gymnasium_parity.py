@@ -1,6 +1,6 @@
 """Our environments against Gymnasium's own, from the same states and actions.
 
-On MuJoCo C whole episodes are equal, to float32; on MJX single control steps are near (all tasks: `-m slow`).
+On MuJoCo C complete episodes are equal, to float32; on MJX single control steps are near (all tasks: `-m slow`).
 """
 
 import gymnasium
@@ -9,7 +9,8 @@ import pytest
 from gym_reference import MJX_TASKS, environment, ours, recorded
 
 from experiments.gymnasium_parity.gymnasium_reference import episode, gymnasium_environment
-from experiments.parity import EPISODES, compare_episodes
+from experiments.gymnasium_parity.parity_report import EPISODES
+from experiments.gymnasium_parity.trajectories import compare_episodes
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 
@@ -25,10 +26,10 @@ def name(request):
     return request.param
 
 
-# Whole episodes on MuJoCo C
+# Complete episodes on MuJoCo C
 
 
-# They observe what the humanoid does, or less: compiling that takes longest of all.
+# The slowest to compile: the largest observations.
 LARGE = ("humanoid", "humanoid_standup", "humanoid-v5", "humanoid_standup-v5", "ant-v5")
 
 
