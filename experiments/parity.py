@@ -2,8 +2,8 @@
 
 Compares for each task and version: complete episodes on MuJoCo C with Gymnasium's own environment, single control steps
 of each physics from the same states, and starts and episodes in distribution. Measures the speed of five environments
-in parallel. All tasks take the better part of an hour on a small CPU; --tasks chooses some. Of the benchmark's flags,
---tasks, --physics, --solver, --seconds and --repeats apply here.
+in parallel. Every version of every task is compared unless --tasks names some. Of the benchmark's flags, --tasks,
+--physics, --solver, --seconds and --repeats apply here.
 """
 
 import sys
@@ -18,7 +18,7 @@ from experiments.benchmarks.machine import machine
 from experiments.benchmarks.measure_envs import env_steps
 from experiments.benchmarks.timing import measure_interleaved
 from experiments.commandline import arguments
-from experiments.gymnasium_parity.parity_report import Cases, Counts, compare_task, physics_cases, report
+from experiments.gymnasium_parity.parity_report import Cases, Counts, TaskParity, compare_task, physics_cases, report
 from experiments.running import runtime
 from sqt_jax.envs import TASKS
 
@@ -45,7 +45,8 @@ def main(argv: Sequence[str]) -> None:
     runtime.prepare()
     cases = physics_cases(physics_here(), solver_limits())
     counts = Counts(states=FLAGS.states, starts=FLAGS.starts, episodes=FLAGS.episodes)
-    found, speeds = {}, {}
+    found: dict[str, TaskParity] = {}
+    speeds: dict[tuple[str, str], float] = {}
     for name in FLAGS.tasks:
         print(f"{name} ...", file=sys.stderr, flush=True)
         found[name] = compare_task(name, cases, counts)

@@ -87,11 +87,7 @@ def report(
       command: the command line that made the report.
     """
     about = ", ".join(f"{key}: {value}" for key, value in machine.items())
-    steps = {
-        (name, case): (errors, speeds[name, case])
-        for name, task in found.items()
-        for case, errors in task.steps.items()
-    }
+    errors = {(name, case): row for name, task in found.items() for case, row in task.steps.items()}
     return "\n".join(
         [
             "# Parity with Gymnasium",
@@ -110,11 +106,11 @@ def report(
             "quantile over the states of the largest error of an entry. qvel in rad/s or m/s; observation as above.",
             f"The speed is that of {members} environments in parallel with random actions, resets included.",
             "",
-            *step_table(steps),
+            *step_table({case: (row, speeds[case]) for case, row in errors.items()}),
             "",
             "## Starts",
             "",
-            "Positions and velocities in units of the task's noise, ours against Gymnasium's; the largest of all entries:",
+            "Positions, velocities in units of the task's noise, ours against Gymnasium's; the largest of the entries:",
             "difference of the means, of the std (relative), of the ends of the range (only of positions where",
             "velocities are normal), and the p-value of a Kolmogorov-Smirnov test times the number of entries.",
             "",

@@ -1,4 +1,4 @@
-"""Our environments against Gymnasium's from the same states and actions: complete episodes, and single control steps."""
+"""Our environments against Gymnasium's from the same states and actions: complete episodes, control steps."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
