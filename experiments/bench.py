@@ -35,10 +35,10 @@ from pathlib import Path
 import jax
 from absl import app, flags, logging
 
-from experiments.benchmarks import bench_flags, compare, operations, output, suites
+from experiments.benchmarks import bench_flags, compare
 from experiments.benchmarks.bench_flags import FLAGS, check_flags
 from experiments.benchmarks.machine import machine
-from experiments.benchmarks.measurements import Failure, Measurement, error_line
+from experiments.benchmarks.session import measure_and_save
 from experiments.running import runtime
 from sqt_jax import envs
 
@@ -60,50 +60,17 @@ def main(argv: Sequence[str]) -> None:
         if missing := envs.lacks(name):
             print(f"without {name}, which needs {missing}", flush=True)
     with bench_flags.exit_on_usage_error():
-        failures = measure(request, environment)
+        failures = measure_and_save(
+            request,
+            environment,
+            json_path=Path(FLAGS.json) if FLAGS.json else None,
+            figures=Path(FLAGS.figures),
+            with_peak=FLAGS.peak,
+            seconds=FLAGS.seconds,
+            repeats=FLAGS.repeats,
+        )
     if failures:
         sys.exit(f"{len(failures)} failed: the lines that begin with `failed` say what, and why")
-
-
-def measure(request: suites.Request, environment: dict[str, str]) -> list[Failure]:
-    """Makes the measurements, saves after each and prints all at the end, also when interrupted; returns failures.
-
-    Args:
-      environment: environment variables of the peers' processes.
-
-    Raises:
-      UsageError: --json or --figures cannot be written.
-    """
-    timing = {"seconds": FLAGS.seconds, "repeats": FLAGS.repeats}
-    measurements: list[Measurement] = []
-    failures: list[Failure] = []
-    peak = 0.0
-
-    def add(found: Measurement | Failure) -> None:
-        output.print_result(found)
-        if isinstance(found, Failure):
-            failures.append(found)
-        else:
-            measurements.append(found)
-
-    def save() -> None:
-        if FLAGS.json:
-            output.save_json(Path(FLAGS.json), measurements, failures, peak)
-
-    try:
-        for found in suites.measure_all(request, environment, **timing):
-            add(found)
-            save()
-        if FLAGS.peak and any(found.operations for found in measurements):
-            try:
-                peak = operations.peak(**timing)
-                print(f"peak of matrix products: {peak / 1e9:,.0f} GFLOP/s", flush=True)
-            except Exception as error:
-                add(Failure("peak of matrix products", error_line(error)))
-            save()
-    finally:
-        output.print_all(measurements, peak, Path(FLAGS.figures))
-    return failures
 
 
 if __name__ == "__main__":

@@ -63,9 +63,8 @@ def reject_other_bench_flags() -> None:
     """Exits with one line if a flag was given that applies only to the benchmark."""
     for flag in FLAGS.flags_by_module_dict()[bench_flags.__name__]:
         if flag.present and flag.name not in BENCH_FLAGS:
-            sys.exit(
-                f"--{flag.name}: has no effect here; expects of the benchmark's flags --{', --'.join(BENCH_FLAGS)}"
-            )
+            names = ", ".join(f"--{name}" for name in BENCH_FLAGS)
+            sys.exit(f"--{flag.name}: has no effect here; of the benchmark's flags only {names} apply")
 
 
 def measure_speeds(name: str, cases: Cases) -> dict[str, float]:

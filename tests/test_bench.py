@@ -11,6 +11,7 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench
+from experiments.benchmarks import session
 from experiments.benchmarks.kernels import Kind
 from experiments.benchmarks.measurements import Failure, Measurement
 from sqt_jax.envs import physics
@@ -21,7 +22,7 @@ def run(monkeypatch, tmp_path):
     """The command with a function in place of `suites.measure_all`."""
 
     def main(measure_all, **given):
-        monkeypatch.setattr(bench.suites, "measure_all", measure_all)
+        monkeypatch.setattr(session.suites, "measure_all", measure_all)
         with flagsaver.flagsaver(json=str(tmp_path / "bench.json"), **given):
             bench.FLAGS.mark_as_parsed()
             bench.main(["bench"])
@@ -76,7 +77,7 @@ def test_the_file_is_written_with_every_measurement_and_the_table_when_interrupt
 
 @pytest.mark.parametrize(("asked", "peak"), [(True, 5.0), (False, 0.0)])
 def test_the_peak_is_measured_with_updates_unless_switched_off(run, tmp_path, monkeypatch, asked, peak):
-    monkeypatch.setattr(bench.operations, "peak", lambda **timing: 5.0)
+    monkeypatch.setattr(session.operations, "peak", lambda **timing: 5.0)
     run(lambda *given, **timing: [Measurement("update", "a", 5, "member updates", 1.0, operations=1.0)], peak=asked)
     assert json.loads((tmp_path / "bench.json").read_text())["peak"] == peak
 

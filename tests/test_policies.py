@@ -49,7 +49,7 @@ def test_the_best_is_chosen_of_those_that_are_asked_for(run, returns, asked, mem
     [
         ({"seed": 4}, "--seed=4: expects a seed of the run, one of 3, 5"),
         ({"number": 4}, "--member=4: expects one of the run's members, 0 to 3"),
-        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; expects --seed or --member"),
+        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; expects only one of --seed and --member"),
     ],
 )
 def test_members_that_the_run_does_not_have(run, asked, says):

@@ -1,4 +1,4 @@
-"""The suites' measurements: those that are asked for, each independent of the others."""
+"""The suites' measurements: the requested ones, each independent of the others."""
 
 from experiments.benchmarks import suites
 from experiments.benchmarks.measurements import Measurement
@@ -21,7 +21,7 @@ def test_a_measurement_that_raises_is_a_failure_and_the_next_is_made(monkeypatch
     assert found[3].what == "checkpoint: sac, ant"
 
 
-def test_every_suite_measures_what_is_asked_for(monkeypatch):
+def test_every_suite_makes_its_measurements(monkeypatch):
     made = []
     for name in ("env", "physics", "updates", "replay", "memory", "checkpoint", "loops"):
         monkeypatch.setattr(

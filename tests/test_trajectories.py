@@ -5,13 +5,13 @@ from functools import cache
 import jax.numpy as jnp
 
 from experiments.gymnasium_parity import trajectories
-from experiments.gymnasium_parity.gymnasium_reference import episode
+from experiments.gymnasium_parity.gymnasium_reference import record_episode
 from sqt_jax import envs
 
 
 @cache
 def swimmer():
-    return envs.make("swimmer", "mujoco"), [episode("swimmer", 0, 1.0, steps=30)]
+    return envs.make("swimmer", "mujoco"), [record_episode("swimmer", 0, 1.0, steps=30)]
 
 
 def test_complete_episodes_are_equal_and_a_fault_is_detected():

@@ -21,7 +21,7 @@ class Window:
 
     def __init__(self, pictures):
         self.left, self.shown, self.closed = pictures, [], False
-        self.cam, self.told = mujoco.MjvCamera(), threading.Event()
+        self.cam, self.close_requested = mujoco.MjvCamera(), threading.Event()
 
     @contextmanager
     def launch(self, model, data, show_left_ui, show_right_ui):
@@ -31,10 +31,10 @@ class Window:
         try:
             yield self
         finally:
-            self.told.set()
+            self.close_requested.set()
 
     def _draw(self):
-        self.told.wait(10)
+        self.close_requested.wait(10)
         time.sleep(0.1)  # it closes in its own time
         self.closed = True
 

@@ -61,7 +61,7 @@ def _events(path: Path) -> list[dict[str, Any]]:
 def innermost(events: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The operations among profiler events, without those that enclose others on their thread.
 
-    Names do not tell them apart: `call` is a loop that a CPU runs as one kernel, or an operation that encloses others.
+    Names do not identify them: `call` is a loop that a CPU runs as one kernel, or an operation that encloses others.
     """
     operations = [event for event in events if event.get("ph") == "X" and event.get("args", {}).get("hlo_op")]
     operations.sort(key=lambda event: (event["pid"], event["tid"], event["ts"], -event["dur"]))

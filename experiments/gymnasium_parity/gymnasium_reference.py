@@ -57,11 +57,22 @@ def recorded(name: str, count: int) -> Recorded:
         env.set_state(qpos, qvel)
         first_obs = env._get_obs()
         obs, reward, terminated, *_ = env.step(action * scale)
-        rows.append((qpos, qvel, action, first_obs, obs, reward, terminated, env.data.qvel.copy()))
-    return Recorded(*(np.array(column) for column in zip(*rows, strict=True)))
+        rows.append(
+            Recorded(
+                qpos=qpos,
+                qvel=qvel,
+                action=action,
+                first_obs=first_obs,
+                obs=obs,
+                reward=reward,
+                terminated=terminated,
+                next_qvel=env.data.qvel.copy(),
+            )
+        )
+    return Recorded(*map(np.array, zip(*rows, strict=True)))
 
 
-class Episode(NamedTuple):
+class RecordedEpisode(NamedTuple):
     """A complete episode in Gymnasium of T steps, from an initial state of float32 numbers."""
 
     qpos: np.ndarray  # [nq], initial
@@ -73,7 +84,7 @@ class Episode(NamedTuple):
     terminated: np.ndarray  # [T]
 
 
-def episode(name: str, seed: int, scale: float, steps: int = 1000) -> Episode:
+def record_episode(name: str, seed: int, scale: float, steps: int = 1000) -> RecordedEpisode:
     """An episode of random actions in [-scale, scale] until it terminates, of at most `steps` steps."""
     env = gymnasium_environment(name)
     env.reset(seed=seed)
@@ -91,7 +102,7 @@ def episode(name: str, seed: int, scale: float, steps: int = 1000) -> Episode:
         if step[2]:
             break
     obs, reward, terminated = (np.array(column) for column in zip(*rows, strict=True))
-    return Episode(
+    return RecordedEpisode(
         qpos=qpos,
         qvel=qvel,
         first_obs=first_obs,

@@ -11,7 +11,7 @@ from experiments.gymnasium_parity.distributions import (
     play_table,
     start_table,
 )
-from experiments.gymnasium_parity.gymnasium_reference import episode
+from experiments.gymnasium_parity.gymnasium_reference import record_episode
 from experiments.gymnasium_parity.trajectories import (
     EpisodeErrors,
     StepErrors,
@@ -57,7 +57,7 @@ def compare_task(name: str, cases: Cases, counts: Counts) -> TaskParity:
     made = {case: envs.make(name, physics, **options) for case, (physics, options) in cases.items()}
     episodes = played = None
     if "mujoco" in made:
-        theirs = [episode(name, seed, scale) for seed, scale in EPISODES]
+        theirs = [record_episode(name, seed, scale) for seed, scale in EPISODES]
         episodes = compare_episodes(made["mujoco"], theirs)
         played = compare_play(name, made["mujoco"], counts.episodes)
     return TaskParity(

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.gymnasium_parity.gymnasium_reference import Episode, recorded
+from experiments.gymnasium_parity.gymnasium_reference import RecordedEpisode, recorded
 from sqt_jax.envs import TASKS
 from sqt_jax.types import Environment
 
@@ -33,7 +33,7 @@ class StepErrors(NamedTuple):
     terminations_agree: float  # share of the states
 
 
-def compare_episodes(env: Environment, episodes: Sequence[Episode]) -> EpisodeErrors:
+def compare_episodes(env: Environment, episodes: Sequence[RecordedEpisode]) -> EpisodeErrors:
     """Repeats the episodes' actions from their initial states.
 
     Args:

@@ -54,7 +54,7 @@ def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str 
         raise ValueError("a film needs a picture")
     height, width, _ = first.shape
     if height % 2 or width % 2:
-        raise ValueError(f"a film expects even numbers of pixels, not {width}x{height}")
+        raise ValueError(f"a film needs even numbers of pixels, not {width}x{height}")
     pictures = chain([first], pictures)
     if name == "gif":
         return _gif(pictures, period)

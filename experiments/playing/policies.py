@@ -57,9 +57,8 @@ def choose(run: Described, returns: Sequence[float], seed: int | None = None, nu
         if number >= len(members):
             raise UsageError(f"--member={number}: expects one of the run's members, 0 to {len(members) - 1}")
         if seed not in (None, members[number].seed):
-            raise UsageError(
-                f"--seed={seed}: member {number} has seed {members[number].seed}; expects --seed or --member"
-            )
+            own = members[number].seed
+            raise UsageError(f"--seed={seed}: member {number} has seed {own}; expects only one of --seed and --member")
         return Chosen(number, members[number], f"of {len(members)}")
     found = [i for i, member in enumerate(members) if seed in (None, member.seed)]
     if not found:
