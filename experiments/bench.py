@@ -13,7 +13,7 @@ Suites:
 
 A measurement compiles a loop (a second to a minute) and reports the median of --repeats timed calls of about --seconds
 each. The default is every suite except growth and memory, on four tasks, with three algorithms and with 1 and 5
-members: about 200 measurements, each of 10 to 90 seconds on a CPU of two cores. One measurement:
+members: about 200 measurements, each roughly 10 to 90 seconds on a CPU with two cores. One measurement:
 --suites=update --algos=td3 --tasks=cheetah --members=5 --nopeak
 
 A machine's speed varies. Compare only figures of one command, or of commands that alternate. To compare the
