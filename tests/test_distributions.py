@@ -1,4 +1,4 @@
-"""Starts and episodes are Gymnasium's in distribution, and what is not is noticed."""
+"""Starts and episodes are Gymnasium's in distribution, and differences are detected."""
 
 import jax
 import pytest
@@ -17,7 +17,7 @@ def test_starts_have_gymnasiums_distribution(name):
 
 @pytest.mark.parametrize("name", ["ant", "walker"])  # normal velocities and uniform ones
 @pytest.mark.parametrize("fault", ["shifted", "wider", "of the other kind"])
-def test_other_starts_are_noticed(name, fault, monkeypatch):
+def test_other_starts_are_detected(name, fault, monkeypatch):
     def drawn(task, qpos0, num_velocities, key, draw=gym_tasks.draw_start):
         if fault == "of the other kind":
             task = task._replace(normal_velocity=not task.normal_velocity)
@@ -39,7 +39,7 @@ def test_episodes_have_gymnasiums_distribution(name):
     assert (found.their_lengths.std() > 0) == (TASKS[name].healthy is not None)
 
 
-def test_other_episodes_are_noticed():
+def test_other_episodes_are_detected():
     env = envs.make("hopper", "mujoco")
     found = distributions.compare_play("hopper", env._replace(step=lambda t, action: env.step(t, -action)), 60)
     assert found.length_p_value < 1e-3 and found.return_p_value < 1e-3

@@ -1,4 +1,4 @@
-"""Episodes that are played to be shown are those that are evaluated, state by state."""
+"""Played episodes are the same as evaluated ones, state by state."""
 
 import jax
 import jax.numpy as jnp
@@ -32,9 +32,9 @@ def counting(length_limit=200):
     return make_environment("counting", 1, 1, length_limit, start, advance)
 
 
-def test_each_episode_goes_to_its_own_end_and_shows_its_own_states():
-    told = []
-    played = play(counting(), zeros, lambda t: (t.state.task[0], t.obs), KEY, num_episodes=5, watch=told.append)
+def test_each_episode_runs_to_its_own_end_and_shows_its_own_states():
+    watched = []
+    played = play(counting(), zeros, lambda t: (t.state.task[0], t.obs), KEY, num_episodes=5, watch=watched.append)
     lengths = [int(episode.shown[1][0, 0]) for episode in played]
     assert [episode.length for episode in played] == lengths and len(set(lengths)) > 2
     for episode, length in zip(played, lengths, strict=True):
@@ -44,7 +44,7 @@ def test_each_episode_goes_to_its_own_end_and_shows_its_own_states():
         assert episode.total == length * (length + 1) / 2
         assert (episode.terminated, episode.truncated) == (True, False)
         assert ending(episode) == "terminated by the task"
-    assert told == [CHUNK * (i + 1) for i in range(len(told))] and told[-1] >= max(lengths) > told[-2]
+    assert watched == [CHUNK * (i + 1) for i in range(len(watched))] and watched[-1] >= max(lengths) > watched[-2]
 
 
 @pytest.mark.parametrize(

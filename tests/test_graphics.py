@@ -1,4 +1,4 @@
-"""Which OpenGL is chosen, and what is said where there is none."""
+"""Which OpenGL is chosen, and the error if there is none."""
 
 import os
 import subprocess
@@ -37,14 +37,14 @@ def test_the_first_that_works_is_chosen(environment, platform, working, chosen, 
         (
             {},
             "linux",
-            "no OpenGL works here to render with (tried: egl, osmesa); apt-get install libosmesa6 (or libegl1",
+            "no OpenGL works here for rendering (tried: egl, osmesa); apt-get install libosmesa6 (or libegl1",
         ),
         (DISPLAY, "linux", "(tried: glfw, egl, osmesa); apt-get install libosmesa6"),
         ({"MUJOCO_GL": "egl"}, "linux", "MUJOCO_GL=egl cannot render here; unset it, or apt-get install libosmesa6"),
-        ({}, "darwin", "(tried: MuJoCo's own); rendering needs a session with graphics"),
+        ({}, "darwin", "(tried: MuJoCo's own); rendering needs a graphical session"),
     ],
 )
-def test_what_to_install_is_said_where_none_works(environment, platform, says):
+def test_the_error_says_what_to_install(environment, platform, says):
     with pytest.raises(NoGraphics) as error:
         choose(environment, platform, lambda name: False)
     assert says in str(error.value) and str(error.value).isprintable()

@@ -1,31 +1,31 @@
-"""How cost grows: what is varied, and a figure for each."""
+"""Growth of cost: the varied quantities, and a figure for each."""
 
 import pytest
 
-from experiments.benchmarks import growth, measure
-from experiments.benchmarks.measure import Row
+from experiments.benchmarks import growth, measure_replays
+from experiments.benchmarks.measurements import Measurement
 from sqt_jax import algorithms
 
 
 def row(point, rate):
-    return Row("growth", "", 5, "member updates", rate, 0.0, point=point)
+    return Measurement("growth", "", 5, "member updates", rate, 0.0, point=point)
 
 
 def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
-    """Each line in turns."""
+    """And each line is measured interleaved."""
     made, lines = [], []
 
-    def in_turns(cases, **timing):
-        lines.append([case.row.point for case in cases])
+    def measure_cases(cases, **timing):
+        lines.append([case.measurement.point for case in cases])
         for case in cases:
-            case.make()
-            yield case.row
+            case.prepare()
+            yield case.measurement
 
-    monkeypatch.setattr(growth, "in_turns", in_turns)
+    monkeypatch.setattr(growth, "measure_cases", measure_cases)
     monkeypatch.setattr(growth, "usable_devices", lambda count: 2 * count)
     monkeypatch.setattr(growth, "updates", lambda *case, **settings: made.append((*case, settings)))
-    monkeypatch.setattr(measure, "replay_steps", lambda *case: made.append(case))
-    rows = list(growth.rows(["td3"], "ant", 5, seconds=0.0, repeats=1))
+    monkeypatch.setattr(measure_replays, "replay_steps", lambda *case: made.append(case))
+    rows = list(growth.measure_growth(["td3"], "ant", 5, seconds=0.0, repeats=1))
     assert lines == [
         [("members", "td3", count) for count in growth.MEMBERS],
         [("critics", "td3", count) for count in growth.CRITICS],
@@ -46,7 +46,7 @@ def test_a_figure_shows_the_time_of_one_at_every_point(tmp_path, monkeypatch):
     shown = []
     monkeypatch.setattr(growth, "_draw", lambda points, x, y, path: shown.append((points, path.name)))
     rows = [row(("members", "td3", 1), 100.0), row(("members", "td3", 5), 250.0), row(("capacity", "lap", 10), 1e6)]
-    growth.draw([*rows, Row("loop", "", 5, "env steps", 1.0, 0.0)], tmp_path)
+    growth.draw([*rows, Measurement("loop", "", 5, "env steps", 1.0, 0.0)], tmp_path)
     assert shown == [
         ({"td3": {1: pytest.approx(10.0), 5: pytest.approx(4.0)}}, "growth_members.png"),
         ({"lap": {10: pytest.approx(1.0)}}, "growth_capacity.png"),
@@ -62,5 +62,5 @@ def test_figures_are_pictures_with_every_value_on_the_axis(tmp_path):
 
 
 def test_what_did_not_grow_is_not_drawn(tmp_path):
-    assert growth.draw([Row("env", "", 5, "env steps", 1.0, 0.0)], tmp_path / "none") == []
+    assert growth.draw([Measurement("env", "", 5, "env steps", 1.0, 0.0)], tmp_path / "none") == []
     assert not (tmp_path / "none").exists()

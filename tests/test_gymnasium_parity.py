@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from gym_reference import MJX_TASKS, environment, ours, recorded
 
-from experiments.gymnasium_parity.gymnasium_reference import episode, gymnasium_environment
-from experiments.parity import EPISODES, compare_episodes
+from experiments.gymnasium_parity.gymnasium_reference import gymnasium_environment, record_episode
+from experiments.gymnasium_parity.parity_report import EPISODES
+from experiments.gymnasium_parity.trajectories import compare_episodes
 from sqt_jax import envs
 from sqt_jax.envs import TASKS
 
@@ -28,14 +29,14 @@ def name(request):
 # Complete episodes on MuJoCo C
 
 
-# They observe the quantities of the humanoid, or some of them: these take the longest to compile.
+# The slowest to compile: the largest observations.
 LARGE = ("humanoid", "humanoid_standup", "humanoid-v5", "humanoid_standup-v5", "ant-v5")
 
 
 @pytest.mark.parametrize("name", [pytest.param(t, marks=pytest.mark.slow) if t in LARGE else t for t in TASKS])
 def test_complete_episodes_on_mujoco_are_gymnasiums(name):
     """Actions of all sizes, and small ones, with which more robots stay healthy for long."""
-    found = compare_episodes(envs.make(name, "mujoco"), [episode(name, *case) for case in EPISODES])
+    found = compare_episodes(envs.make(name, "mujoco"), [record_episode(name, *case) for case in EPISODES])
     assert found.obs <= 1e-5 and found.reward <= 1e-5  # |error| <= 1e-5 + 1e-5 |x|
     assert found.terminations_agree
     assert found.steps >= 80  # the humanoid falls within 30, whatever it does

@@ -43,7 +43,7 @@ def test_a_loop_that_is_one_kernel_is_an_operation(kinds):
 
 @pytest.mark.slow
 def test_a_loop_is_one_kernel_where_runs_ask_xla_for_it():
-    """With the option of `experiments.running.runtime`; by itself XLA does so with less data only."""
+    """With the option of `experiments.running.runtime`; by default XLA does so only with less data."""
     program = """
 import sys
 from experiments.benchmarks import kernels
@@ -66,7 +66,7 @@ print({kind.name: kind.number for kind in kernels.profile(lambda steps: run(y, s
     assert numbers[0] == 0 < numbers[1]
 
 
-def test_those_that_take_longest_come_first(kinds):
+def test_the_longest_come_first(kinds):
     seconds = [kind.seconds for kind in kinds]
     assert seconds == sorted(seconds, reverse=True) and seconds[0] > 0
 
@@ -75,14 +75,14 @@ def event(name, start, length, thread=1):
     return {"ph": "X", "pid": 7, "tid": thread, "ts": start, "dur": length, "args": {"hlo_op": name}}
 
 
-def test_what_encloses_others_on_its_thread_is_left_out():
+def test_an_operation_that_encloses_others_on_its_thread_is_left_out():
     events = [
         event("while", 0.0, 100.0),
         event("conditional.clone", 10.0, 30.0),
         event("call.1", 10.0, 5.0),  # a kernel
         event("dot", 15.0, 25.0),
         event("dot", 40.0, 60.0),  # one begins where the other ends
-        event("call.2", 20.0, 5.0, thread=2),  # on another thread than what lies around it
+        event("call.2", 20.0, 5.0, thread=2),  # on another thread than the operation around it
         {"ph": "M", "pid": 7, "name": "process_name", "args": {"name": "a"}},
         {"ph": "X", "pid": 7, "tid": 1, "ts": 11.0, "dur": 1.0, "name": "of the host"},
     ]
@@ -97,11 +97,11 @@ def test_a_profile_that_was_cut_is_an_error(tmp_path, monkeypatch):
         json.dump({"traceEvents": [event("dot", 0.0, 1.0)] * 3}, file)
     assert len(kernels._events(path)) == 3
     monkeypatch.setattr(kernels, "MAX_EVENTS", 3)
-    with pytest.raises(RuntimeError, match="^the profile has 3 events, and JAX leaves out what is more"):
+    with pytest.raises(RuntimeError, match="^the profile has 3 events, and JAX drops further ones"):
         kernels._events(path)
 
 
-def test_a_line_tells_how_many_and_where_the_time_goes():
-    line = kernels.told([Kind("dot", 12.0, 0.003), Kind("fusion", 30.0, 0.001)], 0.0025, most=1)
-    assert line == "42 operations a step, 4.00 ms under the profiler (2.50 ms a step without): dot 75% (12)"
-    assert kernels.told([], 0.0025) == "the profile shows no operation"
+def test_a_line_has_the_number_of_operations_and_their_share_of_the_time():
+    line = kernels.summary_line([Kind("dot", 12.0, 0.003), Kind("fusion", 30.0, 0.001)], 0.0025, most=1)
+    assert line == "42 operations per step, 4.00 ms under the profiler (2.50 ms per step without): dot 75% (12)"
+    assert kernels.summary_line([], 0.0025) == "the profile has no operations"

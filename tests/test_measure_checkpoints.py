@@ -1,9 +1,11 @@
+"""The cost of checkpoints."""
+
 from experiments.benchmarks import measure_checkpoints
 
 
-def test_a_checkpoint_is_timed_as_a_whole_in_part_and_as_training_feels_it(monkeypatch):
+def test_a_first_and_a_later_checkpoint_and_the_wait_of_training_are_timed(monkeypatch):
     monkeypatch.setattr(measure_checkpoints, "FILLED", 40)
-    monkeypatch.setattr(measure_checkpoints, "SINCE", 10)
+    monkeypatch.setattr(measure_checkpoints, "NEW", 10)
     monkeypatch.setattr(
         measure_checkpoints.algorithms, "make_config", small(measure_checkpoints.algorithms.make_config)
     )
@@ -11,7 +13,7 @@ def test_a_checkpoint_is_timed_as_a_whole_in_part_and_as_training_feels_it(monke
     assert [row.what for row in rows] == [
         "td3, hopper, all 40 rows, 0 MB",
         "td3, hopper, 10 new rows",
-        "td3, hopper, 10 new rows, until training goes on",
+        "td3, hopper, 10 new rows, until training continues",
     ]
     assert all(row.rate > 0 and row.members == 2 for row in rows)
     assert rows[2].rate >= rows[1].rate

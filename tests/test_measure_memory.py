@@ -1,9 +1,9 @@
-"""The memory of a run at its height."""
+"""The peak memory of a run."""
 
 import pytest
 
 from experiments.benchmarks import measure_memory
-from experiments.benchmarks.measure import MEGABYTES
+from experiments.benchmarks.measurements import MEGABYTES
 from sqt_jax.config import ConfigError
 
 
@@ -17,7 +17,7 @@ def test_a_larger_replay_adds_its_own_size_once():
     assert large.figure == (f"{large.rate:,.0f}", "MB")
 
 
-def test_settings_that_cannot_be_are_refused_before_a_process_starts(monkeypatch):
+def test_invalid_settings_are_rejected_before_a_process_starts(monkeypatch):
     monkeypatch.setattr(measure_memory, "ProcessPoolExecutor", None)
     with pytest.raises(ConfigError, match="batch_size"):
         next(measure_memory.bench_memory("td3", "swimmer", 2, 1, "mujoco"))

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("warp", reason="the extra `warp` is not installed")
 
-from experiments.parity import compare_steps  # noqa: E402
+from experiments.gymnasium_parity.trajectories import compare_steps  # noqa: E402
 from sqt_jax import envs  # noqa: E402
 from sqt_jax.envs import physics  # noqa: E402
 

@@ -25,7 +25,7 @@ def counted(algo, **settings):
 def test_td3():
     actor = O * H + H * H + H * A
     target = actor + N * CRITIC
-    critic = N * (CRITIC + CRITIC + CRITIC - FIRST)  # forwards; weights; inputs, but the batch's own
+    critic = N * (CRITIC + CRITIC + CRITIC - FIRST)  # forwards; weights; inputs, except the batch's
     own = actor + N * CRITIC + N * CRITIC + actor + actor - O * H
     assert counted("td3_sqt") == 2 * B * (target + critic + own / 2)
     assert counted("td3", policy_delay=5) == 2 * B * (target + critic + own / 5)
@@ -39,7 +39,7 @@ def test_sac():
     assert counted("sac") == 2 * B * (target + critic + own)
 
 
-def test_td7_computes_no_gradient_that_nobody_needs():
+def test_td7_computes_no_unused_gradient():
     zs, zsa = O * H + H * H + H * Z, (Z + A) * H + H * H + H * Z
     actor = O * H + (H + Z) * H + H * H + H * A
     critic = FIRST + (H + 2 * Z) * H + H * H + H
@@ -50,7 +50,7 @@ def test_td7_computes_no_gradient_that_nobody_needs():
     assert counted("td7_sqt", embedding_size=Z) == 2 * B * (encoder + target + critics + own / 2)
 
 
-def test_a_loop_is_refused():
+def test_a_loop_is_rejected():
     def looped(x):
         return jax.lax.fori_loop(0, x[0, 0].astype(int), lambda _, y: y @ y, x)
 

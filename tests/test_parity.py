@@ -1,50 +1,18 @@
-"""The parity report: its comparisons notice errors, and its tables hold every task and physics."""
+"""The parity command: its report has every task and physics; invalid flags are rejected."""
 
-from functools import cache
-
-import jax.numpy as jnp
 import pytest
 from absl.testing import flagsaver
 
 from experiments import parity
-from experiments.gymnasium_parity.gymnasium_reference import episode
-from sqt_jax import envs
-
-
-@cache
-def swimmer():
-    return envs.make("swimmer", "mujoco"), [episode("swimmer", 0, 1.0, steps=30)]
-
-
-def test_whole_episodes_are_equal_and_a_fault_is_seen():
-    env, episodes = swimmer()
-    found = parity.compare_episodes(env, episodes)
-    assert found.steps == 30 and found.terminations_agree
-    assert found.obs < 1e-6 and found.reward < 1e-6
-
-    def faulty(timestep, action):
-        timestep = env.step(timestep, action)
-        return timestep._replace(reward=timestep.reward + 0.5, terminated=jnp.array(True))
-
-    found = parity.compare_episodes(env._replace(step=faulty), episodes)
-    assert found.obs < 1e-6 and found.reward > 0.1 and not found.terminations_agree
-
-
-def test_single_steps_are_near_and_a_fault_is_seen():
-    env, _ = swimmer()
-    found = parity.compare_steps("swimmer", env, 16)
-    assert max(found[:6]) < 1e-5 and found.terminations_agree == 1
-
-    def weaker(timestep, action):
-        return env.step(timestep, 0.9 * action)
-
-    found = parity.compare_steps("swimmer", env._replace(step=weaker), 16)
-    assert found.qvel_median > 1e-3 and found.reward_median > 1e-6
+from experiments.gymnasium_parity import parity_report
+from experiments.gymnasium_parity.gymnasium_reference import record_episode
 
 
 def test_the_report_has_a_row_for_every_task_and_physics(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(parity.runtime, "prepare", lambda: None)
-    monkeypatch.setattr(parity, "episode", lambda name, seed, scale: episode(name, seed, scale, steps=20))
+    monkeypatch.setattr(
+        parity_report, "record_episode", lambda name, seed, scale: record_episode(name, seed, scale, steps=20)
+    )
     parity.FLAGS.mark_as_parsed()
     out = tmp_path / "new" / "parity.md"
     with flagsaver.flagsaver(
@@ -70,51 +38,52 @@ def test_the_report_has_a_row_for_every_task_and_physics(tmp_path, capsys, monke
 
 
 @pytest.mark.parametrize(("flag", "value"), [("tasks", "hopper2"), ("physics", "bullet")])
-def test_wrong_names_are_told_in_one_line(flag, value):
+def test_wrong_names_are_rejected_in_one_line(flag, value):
     parity.FLAGS.mark_as_parsed()
     with flagsaver.flagsaver(**{flag: [value]}), pytest.raises(SystemExit) as error:
         parity.main(["parity"])
     assert str(error.value).startswith(f"--{flag}: expects some of ") and "\n" not in str(error.value)
 
 
-OTHERS = ["suites", "suite", "algos", "members", "devices", "capacities", "profile", "figures", "compare", "json"]
+OTHERS = [
+    "suites",
+    "suite",
+    "algos",
+    "members",
+    "devices",
+    "capacities",
+    "profile",
+    "figures",
+    "compare",
+    "json",
+    "peak",
+]
 
 
 @pytest.mark.parametrize("name", [*OTHERS, "peer_python"])
-def test_flags_that_the_benchmark_alone_has_a_use_for_are_refused(name):
+def test_flags_that_apply_only_to_the_benchmark_are_rejected(name):
     parity.FLAGS.mark_as_parsed()
     parity.FLAGS[name].present = 1
     try:
-        with pytest.raises(
-            SystemExit, match=f"^--{name}: has no effect here; expects of the benchmark's flags --tasks"
-        ):
+        with pytest.raises(SystemExit, match=f"^--{name}: has no effect here; of the benchmark's flags only --tasks, "):
             parity.main(["parity"])
     finally:
         parity.FLAGS[name].present = 0
-    for taken in parity.TAKEN:
-        parity.FLAGS[taken].present += 1
+    for applying in parity.BENCH_FLAGS:
+        parity.FLAGS[applying].present += 1
     try:
-        parity.refuse_others()
+        parity.reject_other_bench_flags()
     finally:
-        for taken in parity.TAKEN:
-            parity.FLAGS[taken].present -= 1
+        for applying in parity.BENCH_FLAGS:
+            parity.FLAGS[applying].present -= 1
 
 
-def test_a_report_that_cannot_be_written_is_refused_before_anything_runs(tmp_path):
+def test_a_report_that_cannot_be_written_is_rejected_before_anything_runs(tmp_path):
     parity.FLAGS.mark_as_parsed()
     (tmp_path / "file").write_text("")
-    for out, told in {
+    for out, says in {
         tmp_path: "expects a file, which this folder",
         tmp_path / "file" / "a.md": "expects a file in",
     }.items():
-        with flagsaver.flagsaver(out=str(out)), pytest.raises(SystemExit, match=f"^--out={out}: {told}"):
+        with flagsaver.flagsaver(out=str(out)), pytest.raises(SystemExit, match=f"^--out={out}: {says}"):
             parity.main(["parity"])
-
-
-def test_limits_of_mjxs_solver_are_rows_of_their_own():
-    parity.FLAGS.mark_as_parsed()
-    with flagsaver.flagsaver(solver=["8/3"]):
-        found = parity.cases(["mjx", "mujoco"])
-        assert parity.cases(["mujoco"]).keys() == {"mujoco"}
-    assert found["mjx 8/3"] == ("mjx", {"iterations": 8, "ls_iterations": 3})
-    assert found["mjx"] == ("mjx", {}) and list(found) == ["mjx", "mujoco", "mjx 8/3"]

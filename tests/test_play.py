@@ -1,4 +1,4 @@
-"""The command that shows a policy: what it prints is what an evaluation gives, and the film is of that."""
+"""The command that plays a policy: it prints the returns of an evaluation, and films the same episodes."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from made_runs import add_policies, write_run
 
 import sqt_jax
 from experiments import play
-from experiments.playing import graphics, rendering
+from experiments.playing import graphics, rendering, viewer
 from sqt_jax import envs
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -89,7 +89,7 @@ def test_the_returns_are_an_evaluations_and_the_film_is_of_those_episodes(folder
     assert frames == count and seconds == pytest.approx(count * 0.024, abs=0.03)
 
 
-def test_a_member_is_asked_for_and_steps_are_limited(folder, capsys):
+def test_a_member_is_named_and_steps_are_limited(folder, capsys):
     assert play.main(["play", RUN, "--seed=3", "--steps=4"]) == 0
     out = capsys.readouterr().out
     assert "member 0, seed 3 (of 2)" in out and "4 steps, 0.0 s, cut off" in out
@@ -97,8 +97,6 @@ def test_a_member_is_asked_for_and_steps_are_limited(folder, capsys):
 
 
 def test_where_there_is_a_display_mujocos_viewer_shows_it(folder, capsys, monkeypatch):
-    from experiments.playing import viewer
-
     shown = []
 
     def show(*arguments):
@@ -114,7 +112,7 @@ def test_where_there_is_a_display_mujocos_viewer_shows_it(folder, capsys, monkey
     assert "cannot be shown in MuJoCo's viewer (not on this system); --video=FILE" in capsys.readouterr().err
 
 
-REFUSED = [
+REJECTED = [
     ("", "RUN: expects the folder of one run, as in"),
     (f"{RUN} {BRAX}", "RUN: expects the folder of one run, as in"),
     ("none", "none: there is no such folder"),
@@ -150,8 +148,8 @@ REFUSED = [
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize(("arguments", "says"), REFUSED, ids=[ascii(row[0])[1:60] for row in REFUSED])
-def test_what_cannot_be_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
+@pytest.mark.parametrize(("arguments", "says"), REJECTED, ids=[ascii(row[0])[1:60] for row in REJECTED])
+def test_bad_usage_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
     before = sorted(folder.rglob("*"))
     assert play.main(["play", *(word for word in arguments.split(" ") if word)]) == 2
     out, err = capsys.readouterr()
@@ -159,7 +157,7 @@ def test_what_cannot_be_is_one_line_and_nothing_is_written(folder, pictures, cap
     assert sorted(folder.rglob("*")) == before and (folder / "there.mp4").read_text() == "mine"
 
 
-def test_without_opengl_it_is_said_before_anything_is_played(folder, capsys, monkeypatch):
+def test_without_opengl_a_film_is_rejected_before_anything_is_played(folder, capsys, monkeypatch):
     def none():
         raise graphics.NoGraphics("no OpenGL works here")
 

@@ -1,4 +1,4 @@
-"""Which member of a run is meant, and that its policy is one for the task."""
+"""The member of a run that is chosen, and its policy."""
 
 import json
 import math
@@ -49,20 +49,20 @@ def test_the_best_is_chosen_of_those_that_are_asked_for(run, returns, asked, mem
     [
         ({"seed": 4}, "--seed=4: expects a seed of the run, one of 3, 5"),
         ({"number": 4}, "--member=4: expects one of the run's members, 0 to 3"),
-        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; expects --seed or --member"),
+        ({"number": 1, "seed": 3}, "--seed=3: member 1 has seed 5; expects only one of --seed and --member"),
     ],
 )
-def test_members_that_the_run_has_not(run, asked, says):
+def test_members_that_the_run_does_not_have(run, asked, says):
     with pytest.raises(UsageError) as error:
         policies.choose(policies.read(run), [NAN] * 4, **asked)
     assert str(error.value) == says
 
 
-def test_what_is_told(run):
+def test_the_caption(run):
     described = policies.read(run)
     chosen = policies.choose(described, policies.final_returns(run, 4))
     says = "td3_sqt on hopper: member 1, seed 5, penalty_coef 0.1 (the best of 4 at the last evaluation)"
-    assert policies.told(described, chosen) == says
+    assert policies.caption(described, chosen) == says
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def other_sizes(path):
         (other_sizes, "policy: is not a policy for hopper: its sizes are 2 and 1"),
     ],
 )
-def test_a_policy_that_cannot_be_played_is_refused_in_a_line(run, tmp_path, change, says):
+def test_a_policy_that_cannot_be_played_is_rejected_in_a_line(run, tmp_path, change, says):
     path = tmp_path / "run"
     shutil.copytree(run, path)
     change(path)
@@ -130,6 +130,6 @@ def test_a_policy_that_cannot_be_played_is_refused_in_a_line(run, tmp_path, chan
     assert says in str(error.value) and str(error.value).startswith(str(path)) and str(error.value).isprintable()
 
 
-def test_what_is_no_run_is_refused(tmp_path):
+def test_a_folder_without_a_run_is_rejected(tmp_path):
     with pytest.raises(UsageError, match="expects the folder of a run; it has no config.json that can be read"):
         policies.read(tmp_path)

@@ -58,7 +58,7 @@ def test_the_robot_is_in_view_and_its_ground_below(drawn, task):
     rows, columns = np.nonzero(robot)
     assert robot.sum() > 50
     assert abs(columns.mean() - WIDTH / 2) < WIDTH / 8 and abs(rows.mean() - HEIGHT / 2) < HEIGHT / 4
-    # the camera goes along with it: 30 m on it is there still
+    # the camera follows it: 30 m further it is in view still
     there = abs(far - without).max(axis=2) > 30
     assert abs(np.nonzero(there[:, 10:-10])[1].mean() + 10 - WIDTH / 2) < WIDTH / 4
     # chequered below, the plain sky above
@@ -74,7 +74,7 @@ def test_the_default_camera_follows_the_robot():
         assert model.camera(view.fixedcamid).name == "track" and "track" in rendering.cameras(model)
 
 
-def test_a_model_without_that_camera_is_followed_all_the_same():
+def test_a_model_without_that_camera_is_followed_as_well():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>")
     view = rendering.view_of(model)
     assert (view.type, view.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
@@ -82,7 +82,7 @@ def test_a_model_without_that_camera_is_followed_all_the_same():
         rendering.view_of(model, "side")
 
 
-def test_a_camera_that_the_model_has_not_is_refused():
+def test_a_camera_that_the_model_does_not_have_is_rejected():
     model = load_model(TASKS["ant"])
     with pytest.raises(ValueError, match="expects one of track, not 'side'"):
         next(rendering.frames(model, [model.qpos0], camera="side"))

@@ -1,4 +1,4 @@
-"""Rates: iterations per second, medians, taken in turns."""
+"""Rates: iterations per second, medians, interleaved."""
 
 import pytest
 
@@ -16,7 +16,7 @@ def test_a_rate_is_iterations_per_second(monkeypatch):
     assert timing.measure(run, seconds=10, repeats=3) == (4.0, 5.25)
 
 
-def test_timed_calls_take_turns(monkeypatch):
+def test_timed_calls_are_interleaved(monkeypatch):
     now, calls = 0.0, []
 
     def run(name, seconds_each):
@@ -28,7 +28,7 @@ def test_timed_calls_take_turns(monkeypatch):
         return once
 
     monkeypatch.setattr(timing.time, "perf_counter", lambda: now)
-    found = timing.measure_in_turns([run("a", 0.5), run("b", 0.25)], seconds=1, repeats=3)
+    found = timing.measure_interleaved([run("a", 0.5), run("b", 0.25)], seconds=1, repeats=3)
     assert found == [(2.0, 0.5), (4.0, 0.25)]
     assert "".join(calls).endswith("ababab")
 
@@ -47,12 +47,12 @@ def test_one_that_fails_drops_out_and_the_others_are_measured(monkeypatch):
         return once
 
     monkeypatch.setattr(timing.time, "perf_counter", lambda: now)
-    first, whole, third = timing.tried_in_turns([run("a", 1), run("b", None), run("c", 4)], seconds=1, repeats=3)
-    assert whole == (1.0, 1.0) and calls == {"a": 1, "b": 5, "c": 4}
+    first, second, third = timing.rates_or_errors([run("a", 1), run("b", None), run("c", 4)], seconds=1, repeats=3)
+    assert second == (1.0, 1.0) and calls == {"a": 1, "b": 5, "c": 4}
     assert (str(first), str(third)) == ("a", "c")
     assert first.__traceback__ is None  # whose frames would keep arrays
 
 
-def test_a_measurement_alone_raises_what_its_run_raised():
+def test_one_measurement_raises_its_runs_exception():
     with pytest.raises(ZeroDivisionError):
         timing.measure(lambda iterations: 1 // 0, seconds=1, repeats=1)

@@ -1,4 +1,4 @@
-"""MuJoCo's viewer shows the states in order, in real time, until its window is closed. The window is made up."""
+"""MuJoCo's viewer shows the states in order, in real time, until its window is closed. The window is a fake."""
 
 import threading
 import time
@@ -21,7 +21,7 @@ class Window:
 
     def __init__(self, pictures):
         self.left, self.shown, self.closed = pictures, [], False
-        self.cam, self.told = mujoco.MjvCamera(), threading.Event()
+        self.cam, self.close_requested = mujoco.MjvCamera(), threading.Event()
 
     @contextmanager
     def launch(self, model, data, show_left_ui, show_right_ui):
@@ -31,10 +31,10 @@ class Window:
         try:
             yield self
         finally:
-            self.told.set()
+            self.close_requested.set()
 
     def _draw(self):
-        self.told.wait(10)
+        self.close_requested.wait(10)
         time.sleep(0.1)  # it closes in its own time
         self.closed = True
 
@@ -56,7 +56,7 @@ def states(numbers):
     return qpos, qvel
 
 
-def test_episodes_are_shown_in_turn_until_the_window_is_closed():
+def test_episodes_are_shown_in_order_until_the_window_is_closed():
     window, now, slept = Window(pictures=8), SimpleNamespace(time=0.0), []
 
     def sleep(seconds):
@@ -64,7 +64,7 @@ def test_episodes_are_shown_in_turn_until_the_window_is_closed():
         now.time += seconds
 
     def clock():
-        now.time += 0.002  # what drawing expects
+        now.time += 0.002  # the time to draw
         return now.time
 
     episodes = [states([1, 2, 3]), states([11, 12])]
@@ -83,7 +83,7 @@ def test_a_camera_can_be_named():
         viewer.show(MODEL, [states([1])], 0.008, "side", launch=window.launch)
 
 
-def test_the_window_is_closed_before_an_interrupt_goes_on():
+def test_the_window_is_closed_before_an_interrupt_continues():
     window = Window(pictures=5)
 
     def interrupted(seconds):

@@ -1,1 +1,1 @@
-"""What `experiments.bench` measures, part by part, and the peers that it can be measured beside."""
+"""The measurements of `experiments.bench`, one module per part, and the comparison with other implementations."""

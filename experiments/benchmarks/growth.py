@@ -1,4 +1,4 @@
-"""How cost grows with members, critics and the replay's capacity: `python -m experiments.bench --suite=growth`."""
+"""Cost over members, critics and the replay's capacity: `python -m experiments.bench --suite=growth`."""
 
 import dataclasses
 import functools
@@ -10,7 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-from experiments.benchmarks.measure import REPLAYS, Case, Failure, Row, in_turns, replay_case, updates
+from experiments.benchmarks.measure_replays import REPLAYS, replay_case
+from experiments.benchmarks.measure_updates import updates
+from experiments.benchmarks.measurements import Case, Failure, Measurement, measure_cases
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
 from experiments.running import files
 from sqt_jax.members import usable_devices
@@ -18,51 +20,59 @@ from sqt_jax.members import usable_devices
 MEMBERS = (1, 2, 5, 10, 25, 50)
 CRITICS = (2, 5, 10)
 CAPACITIES = (10_000, 100_000, 1_000_000)
-# What is varied -> the figure's labels.
+# Varied quantity -> the figure's axis labels.
 LABELS = {
-    "members": ("members", "ms an update of one member"),
-    "critics": ("critics", "ms an update of one member"),
-    "capacity": ("capacity of the replay", "µs for a member's sample and feedback"),
+    "members": ("members", "ms per update of one member"),
+    "critics": ("critics", "ms per update of one member"),
+    "capacity": ("capacity of the replay", "µs per sample and feedback of one member"),
 }
-UNITS = {"members": 1e3, "critics": 1e3, "capacity": 1e6}
+PER_SECOND = {"members": 1e3, "critics": 1e3, "capacity": 1e6}
 
 
-def rows(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterator[Row | Failure]:
-    """Updates over members and critics, samples over capacities; `members` where they do not vary.
+def measure_growth(algos: Sequence[str], task: str, members: int, **timing: Any) -> Iterator[Measurement | Failure]:
+    """Measures updates over members and over critics, and samples over capacities.
 
-    Members lie on devices as those of a run do.
+    The points of a line are interleaved, so that a change of the machine's speed does not bend it. Members are spread
+    over devices as in a run.
 
-    The points of a line are measured in turns: a machine that slows down bends none of them.
+    Args:
+      members: where the number does not vary.
+      timing: `seconds` and `repeats` of `timing.measure`.
     """
     for algo in algos:
-        yield from in_turns([_update(algo, task, count, ("members", algo, count)) for count in MEMBERS], **timing)
+        yield from measure_cases([_update(algo, task, count, ("members", algo, count)) for count in MEMBERS], **timing)
         critics = [_update(algo, task, members, ("critics", algo, count), ensemble_size=count) for count in CRITICS]
-        yield from in_turns(critics, **timing)
+        yield from measure_cases(critics, **timing)
     for kind in REPLAYS:
-        yield from in_turns([_sample(kind, task, members, capacity) for capacity in CAPACITIES], **timing)
+        yield from measure_cases([_sample(kind, task, members, capacity) for capacity in CAPACITIES], **timing)
 
 
 def _update(algo: str, task: str, members: int, point: tuple[str, str, int], **settings: int) -> Case:
     varied, _, value = point
     what = f"{algo}, {task} sizes" + (f", {value} critics" if varied == "critics" else "")
     devices = usable_devices(members)
-    row = Row("growth", what, members, "member updates", devices=devices, point=point)
-    return Case(row, functools.partial(updates, algo, task, members, devices, **settings))
+    measurement = Measurement("growth", what, members, "member updates", devices=devices, point=point)
+    return Case(measurement, functools.partial(updates, algo, task, members, devices, **settings))
 
 
 def _sample(kind: str, task: str, members: int, capacity: int) -> Case:
-    row, make = replay_case(kind, "sample", task, capacity, members)
-    return Case(dataclasses.replace(row, suite="growth", point=("capacity", kind, capacity)), make)
+    measurement, prepare = replay_case(kind, "sample", task, capacity, members)
+    return Case(dataclasses.replace(measurement, suite="growth", point=("capacity", kind, capacity)), prepare)
 
 
-def draw(found: Sequence[Row], folder: Path) -> list[Path]:
-    """A figure for each thing that was varied; their files."""
+def draw(found: Sequence[Measurement], folder: Path) -> list[Path]:
+    """Writes a PNG figure per varied quantity into `folder`, which is created; returns their paths.
+
+    Raises:
+      OSError: a file cannot be written.
+    """
     paths = []
     for varied, (x_label, y_label) in LABELS.items():
         points: dict[str, dict[int, float]] = {}
-        for row in found:
-            if row.point and row.point[0] == varied:
-                points.setdefault(row.point[1], {})[row.point[2]] = UNITS[varied] / row.rate
+        for measurement in found:
+            if measurement.point and measurement.point[0] == varied:
+                _, line, value = measurement.point
+                points.setdefault(line, {})[value] = PER_SECOND[varied] / measurement.rate
         if points:
             folder.mkdir(parents=True, exist_ok=True)
             paths.append(folder / f"growth_{varied}.png")

@@ -1,7 +1,7 @@
-"""What a compiled loop runs on the device: its operations by kind, counted and timed by JAX's profiler.
+"""The device operations of a compiled loop by kind, counted and timed by JAX's profiler.
 
-Times are those under the profiler: each operation is noted, and on a GPU XLA starts the kernels one by one then, where
-it otherwise starts many at once as a CUDA graph. How often each runs, and their shares, are what to read.
+The profiler slows the loop: it records each operation, and on a GPU XLA then launches kernels one by one instead of
+many at once as a CUDA graph. Read the counts and the shares of the time, not the times.
 """
 
 import gzip
@@ -15,24 +15,24 @@ from typing import Any, NamedTuple
 
 import jax
 
-MAX_EVENTS = 1_000_000  # JAX writes no more of them, and says nothing of the others
+MAX_EVENTS = 1_000_000  # JAX drops further events without a message
 
 
 class Kind(NamedTuple):
-    """Operations of one name but for its number, as XLA calls them (`dot`, `add_convert_fusion`)."""
+    """Operations of one XLA name without its number (`dot`, `add_convert_fusion`)."""
 
     name: str
-    number: float  # a step, of all devices together
-    seconds: float  # likewise, under the profiler
+    number: float  # per step, all devices together
+    seconds: float  # per step, all devices together, under the profiler
 
 
 def profile(run: Callable[[int], Any], steps: int) -> list[Kind]:
-    """The operations of a step of `run(steps)`, which has compiled; those that take longest first.
+    """The operations of one step of `run(steps)`, longest first. `run` has to be compiled already.
 
-    On a GPU an operation is a kernel, but for those that stand for several (a library's matrix product).
+    On a GPU an operation is a kernel, except a few that stand for several (a library's matrix product).
 
     Raises:
-      RuntimeError: so many events that some are missing.
+      RuntimeError: the profile is incomplete, because it has too many events.
     """
     options = jax.profiler.ProfileOptions()
     options.python_tracer_level = 0  # no Python functions
@@ -54,14 +54,14 @@ def _events(path: Path) -> list[dict[str, Any]]:
     with gzip.open(path) as file:
         events = json.load(file)["traceEvents"]
     if len(events) >= MAX_EVENTS:
-        raise RuntimeError(f"the profile has {len(events):,} events, and JAX leaves out what is more")
+        raise RuntimeError(f"the profile has {len(events):,} events, and JAX drops further ones")
     return events
 
 
 def innermost(events: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The operations among the events but those that enclose others on their thread, which are told one by one.
+    """The operations among profiler events, without those that enclose others on their thread.
 
-    Not by their names: a loop over little data that a CPU runs as one kernel is a `call`, and so may be what encloses.
+    Names do not identify them: `call` is a loop that a CPU runs as one kernel, or an operation that encloses others.
     """
     operations = [event for event in events if event.get("ph") == "X" and event.get("args", {}).get("hlo_op")]
     operations.sort(key=lambda event: (event["pid"], event["tid"], event["ts"], -event["dur"]))
@@ -76,17 +76,19 @@ def innermost(events: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [one for one, following in pairs if not encloses(one, following)] + operations[-1:]
 
 
-def told(kinds: Sequence[Kind], seconds: float, most: int = 6) -> str:
-    """One line: how many operations a step has, and the shares in its time of those that take longest.
+def summary_line(kinds: Sequence[Kind], seconds: float, most: int = 6) -> str:
+    """One line: the number of operations per step, and the share of time of the longest kinds.
 
     Args:
+      kinds: as from `profile`.
       seconds: of a step without the profiler.
+      most: number of kinds in the line.
     """
     if not kinds:
-        return "the profile shows no operation"
+        return "the profile has no operations"
     total = sum(kind.seconds for kind in kinds)
     shares = [f"{kind.name} {kind.seconds / total:.0%} ({kind.number:,.0f})" for kind in kinds[:most]]
     return (
-        f"{sum(kind.number for kind in kinds):,.0f} operations a step, {1e3 * total:.2f} ms under the profiler "
-        f"({1e3 * seconds:.2f} ms a step without): {', '.join(shares)}"
+        f"{sum(kind.number for kind in kinds):,.0f} operations per step, {1e3 * total:.2f} ms under the profiler "
+        f"({1e3 * seconds:.2f} ms per step without): {', '.join(shares)}"
     )

@@ -1,4 +1,4 @@
-"""What a checkpoint costs: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
+"""Checkpoints per second: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
 
 import statistics
 import tempfile
@@ -9,18 +9,18 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments.benchmarks.measure import Row, member_keys
+from experiments.benchmarks.measurements import Measurement, member_keys
 from experiments.running.checkpoints import Checkpoints
 from experiments.running.loop import Position
 from sqt_jax import algorithms, envs, train
 from sqt_jax.members import layout_here
 
-FILLED = 100_000  # rows of the replay
-SINCE = 25_000  # of them those that came since the last checkpoint: the default interval
+FILLED = 100_000  # rows in the replay
+NEW = 25_000  # rows since the last checkpoint: the default interval
 
 
-def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterator[Row]:
-    """A first checkpoint with all rows, a later one with those of an interval, and how long training waits for it."""
+def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterator[Measurement]:
+    """A first checkpoint with all rows, a later one with the rows of one interval, and how long it blocks training."""
     config = algorithms.make_config(algo, task, replay_capacity=FILLED)
     trainer = algorithms.make_trainer(config)
     replay = algorithms.replay_of(config, envs.make(task))
@@ -32,24 +32,26 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
             store = Checkpoints(Path(folder), replay, layout, 2, print)
-            save(store, state, FILLED - SINCE)
-            waiting, whole = save(store, state, FILLED)
+            save(store, state, FILLED - NEW)
+            waiting, complete = save(store, state, FILLED)
             waits.append(waiting)
-            later.append(whole)
+            later.append(complete)
         with tempfile.TemporaryDirectory() as folder:
             everything.append(save(Checkpoints(Path(folder), replay, layout, 2, print), state, FILLED)[1])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
-    def row(what: str, seconds: list[float]) -> Row:
-        return Row("checkpoint", f"{algo}, {task}, {what}", members, "checkpoints", 1 / statistics.median(seconds))
+    def measured(what: str, seconds: list[float]) -> Measurement:
+        return Measurement(
+            "checkpoint", f"{algo}, {task}, {what}", members, "checkpoints", 1 / statistics.median(seconds)
+        )
 
-    yield row(f"all {FILLED:,} rows, {size / 1e6:,.0f} MB", everything)
-    yield row(f"{SINCE:,} new rows", later)
-    yield row(f"{SINCE:,} new rows, until training goes on", waits)
+    yield measured(f"all {FILLED:,} rows, {size / 1e6:,.0f} MB", everything)
+    yield measured(f"{NEW:,} new rows", later)
+    yield measured(f"{NEW:,} new rows, until training continues", waits)
 
 
 def save(store: Checkpoints, state: train.TrainState, at: int) -> tuple[float, float]:
-    """Seconds until training could go on, and until the checkpoint is on disk."""
+    """Saves a checkpoint after `at` steps: the seconds until training can continue, and until it is on disk."""
     began = time.perf_counter()
     store.save(state, Position(at, at), {})
     waiting = time.perf_counter() - began

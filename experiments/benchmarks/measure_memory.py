@@ -1,6 +1,6 @@
-"""The memory that a run expects at its height: `python -m experiments.bench --suites=memory --tasks=humanoid`.
+"""The peak memory of a run: `python -m experiments.bench --suites=memory --tasks=humanoid`.
 
-Each case is a process of its own, since a process's highest memory never falls.
+Each case runs in a process of its own, because a process's peak memory never falls.
 """
 
 import multiprocessing
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments.benchmarks.measure import MEGABYTES, Row, member_keys
+from experiments.benchmarks.measurements import MEGABYTES, Measurement, member_keys
 from experiments.running import runtime
 from experiments.running.checkpoints import Checkpoints
 from experiments.running.loop import Position
@@ -23,37 +23,41 @@ from sqt_jax import algorithms, envs, train
 from sqt_jax.config import Config
 from sqt_jax.members import layout_here
 
-STEPS = 1_000_000  # as a run has by itself
-SAVED = 25_000  # rows of a checkpoint: the default interval's
+STEPS = 1_000_000  # a run's default
+SAVED = 25_000  # rows of a checkpoint: the default interval
 
 
 class Memory(NamedTuple):
     """Bytes."""
 
-    started: int  # the process with all that it imports, before the first array
-    highest: int  # at any time: compilation, warm-up, training, evaluation, a checkpoint
-    on_device: int | None  # the same of an accelerator, where there is one
-    estimate: int  # of the replay and the agents, which a run makes before it begins
+    started: int  # the process with its imports, before the first array
+    peak: int  # of the process during compilation, warm-up, training, evaluation and a checkpoint
+    on_device: int | None  # peak of the accelerator's memory; None on a CPU
+    estimate: int  # of replay and agents, as a run prints it before it starts
     replay: int
 
 
-def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str) -> Iterator[Row]:
-    """The process's memory at its height, and what it consists of; an accelerator's in a row of its own."""
+def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str) -> Iterator[Measurement]:
+    """The process's peak memory and its parts; an accelerator's as a second measurement.
+
+    Raises:
+      ConfigError: an invalid setting.
+    """
     config = algorithms.make_config(algo, task, physics=physics, steps=max(STEPS, capacity), replay_capacity=capacity)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         found = pool.submit(_measured, config, members).result()
     case = f"{algo} on {task}, {physics}, capacity {capacity:,}"
     parts = {"before the first array": found.started, "replay": found.replay, "estimate": found.estimate}
-    told = ", ".join(f"{name} {size / 1e6:,.0f}" for name, size in parts.items())
-    yield Row("memory", f"{case}: at most ({told})", members, MEGABYTES, found.highest / 1e6)
+    listed = ", ".join(f"{name} {size / 1e6:,.0f}" for name, size in parts.items())
+    yield Measurement("memory", f"{case}: at most ({listed})", members, MEGABYTES, found.peak / 1e6)
     if found.on_device:
-        yield Row("memory", f"{case}: at most on the device", members, MEGABYTES, found.on_device / 1e6)
+        yield Measurement("memory", f"{case}: at most on the device", members, MEGABYTES, found.on_device / 1e6)
 
 
 def _measured(config: Config, members: int) -> Memory:
     runtime.prepare()
     runtime.divide_processor(members)
-    started = _highest()
+    started = _peak_bytes()
     trainer = algorithms.make_trainer(config)
     replay = algorithms.replay_of(config, envs.make(config.env, config.physics))
     layout = layout_here(members)
@@ -72,13 +76,13 @@ def _measured(config: Config, members: int) -> Memory:
     on_device = jax.devices()[0].memory_stats() or {}
     return Memory(
         started=started,
-        highest=_highest(),
+        peak=_peak_bytes(),
         on_device=on_device.get("peak_bytes_in_use"),
         estimate=algorithms.memory_estimate(config, members),
         replay=rows,
     )
 
 
-def _highest() -> int:
-    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss
+def _peak_bytes() -> int:
+    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,7 +1,7 @@
-"""Floating-point operations: what an update needs, and what the machine can make of them.
+"""Floating-point operations of an update, and the most that the machine reaches per second.
 
-Counted are those of the matrix products, 2 m n k each, from the shapes in the traced function; what else an update
-does (activations, Adam) is a few per cent of them, and is limited by memory, not by arithmetic.
+Only matrix products are counted, 2 m n k each, from the shapes in the traced function. The rest of an update
+(activations, Adam) adds a few per cent, and is limited by memory, not by arithmetic.
 """
 
 import math
@@ -14,18 +14,27 @@ import jax.numpy as jnp
 from experiments.benchmarks.timing import measure
 from sqt_jax.types import Agent, State, Transition
 
-# Products [S, M, K] @ [S, K, K] by which the peak is measured: a layer of one member, of several, a large one.
+# (S, M, K) of the products [S, M, K] @ [S, K, K] that measure the peak: a layer of one member, of several, a large one.
 PEAK_SHAPES = ((1, 256, 256), (5, 256, 256), (10, 256, 256), (1, 1024, 1024), (1, 2048, 2048))
 
 
 def of_update(agent: Agent, state: State, batch: Transition, policy_delay: int) -> float:
-    """Operations of one member's update: the mean over the updates with and without a step of the actor."""
+    """Operations of one member's update, averaged over updates with and without an actor step.
+
+    Args:
+      state: of one member; shapes suffice (`jax.eval_shape`).
+      batch: [B, ...], likewise.
+      policy_delay: critic updates per actor step.
+
+    Raises:
+      ValueError: a matrix product is in a loop of unknown length.
+    """
     jaxpr = jax.make_jaxpr(agent.update)(state, batch, jax.random.key(0), jnp.int32(0)).jaxpr
     return _of_products(jaxpr, share=1 / policy_delay)
 
 
 def _of_products(jaxpr: Any, share: float) -> float:
-    """Of a condition, the costliest branch counts, at its share of the updates."""
+    """Operations of a jaxpr; a `cond` counts its costliest branch times `share`."""
     total = 0.0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
@@ -35,14 +44,14 @@ def _of_products(jaxpr: Any, share: float) -> float:
         elif equation.primitive.name == "cond":
             total += share * max(_of_products(branch.jaxpr, share) for branch in equation.params["branches"])
         else:
-            inner = sum(_of_products(sub, share) for sub in _inside(equation.params))
+            inner = sum(_of_products(sub, share) for sub in _inner_jaxprs(equation.params))
             if inner and equation.primitive.name in ("while", "scan"):
                 raise ValueError("products in a loop of unknown length cannot be counted")
             total += inner
     return total
 
 
-def _inside(params: dict[str, Any]) -> Iterator[Any]:
+def _inner_jaxprs(params: dict[str, Any]) -> Iterator[Any]:
     """The jaxprs among the parameters of an equation."""
     for value in params.values():
         jaxpr = getattr(value, "jaxpr", value)
@@ -51,7 +60,7 @@ def _inside(params: dict[str, Any]) -> Iterator[Any]:
 
 
 def peak(**timing: Any) -> float:
-    """The most operations per second seen in matrix products of float32, one after the other."""
+    """The highest operations per second of float32 matrix products over `PEAK_SHAPES`; `timing` as in `measure`."""
     return max(_rate(shape, **timing) for shape in PEAK_SHAPES)
 
 

@@ -1,4 +1,4 @@
-"""How often per second a compiled loop goes round."""
+"""Iterations per second of compiled loops."""
 
 import statistics
 import time
@@ -9,35 +9,51 @@ import jax
 
 
 def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
-    """Iterations per second of `run(iterations)` (median), and the seconds of the first call, which compiles."""
-    return measure_in_turns([run], seconds, repeats)[0]
+    """Times one loop.
+
+    Args:
+      run: number of iterations -> arrays to wait for.
+      seconds: approximate duration of one timed call.
+      repeats: number of timed calls.
+
+    Returns:
+      Iterations per second (median of the timed calls), and the seconds of the first call, which compiles.
+
+    Raises whatever `run` raises.
+    """
+    return measure_interleaved([run], seconds, repeats)[0]
 
 
-def measure_in_turns(runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int) -> list[tuple[float, float]]:
-    """`measure` of each, one timed call of every one in turn: a machine that slows down does so for all of them."""
+def measure_interleaved(
+    runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int
+) -> list[tuple[float, float]]:
+    """`measure` of each run, with the timed calls interleaved: a change of the machine's speed affects all of them.
+
+    Raises the first error that a run raised, after the others have been timed.
+    """
     rates = []
-    for found in tried_in_turns(runs, seconds, repeats):
+    for found in rates_or_errors(runs, seconds, repeats):
         if isinstance(found, Exception):
             raise found
         rates.append(found)
     return rates
 
 
-def tried_in_turns(
+def rates_or_errors(
     runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int
 ) -> list[tuple[float, float] | Exception]:
-    """`measure_in_turns`, but that one that raises drops out: what it raised stands in its place."""
+    """`measure_interleaved`, with a run's exception in place of its result. It is not called again after that."""
     failed: dict[int, Exception] = {}
 
-    def each(function: Callable[[int], Any]) -> dict[int, Any]:
-        """Of the runs that are left."""
+    def for_each(function: Callable[[int], Any]) -> dict[int, Any]:
+        """The function's results by index, for the runs that have not failed."""
         found = {}
         for index in range(len(runs)):
             if index not in failed:
                 try:
                     found[index] = function(index)
                 except Exception as error:
-                    failed[index] = error.with_traceback(None)  # it would keep the arrays that were in use
+                    failed[index] = error.with_traceback(None)  # the traceback would keep the arrays in use alive
         return found
 
     def timed(index: int, iterations: int) -> float:
@@ -46,15 +62,15 @@ def tried_in_turns(
         return time.perf_counter() - start
 
     def iterations_of(index: int) -> int:
-        """How many take about `seconds`."""
+        """The number of iterations that last about `seconds`."""
         iterations = 1
         while (elapsed := timed(index, iterations)) < seconds / 4:
             iterations = min(iterations * 10, max(iterations + 1, int(iterations * seconds / max(elapsed, 1e-9))))
         return max(1, round(iterations * seconds / elapsed))
 
-    compile_seconds = each(lambda index: timed(index, 1))
-    counts = each(iterations_of)
-    rates = [each(lambda index: counts[index] / timed(index, counts[index])) for _ in range(repeats)]
+    compile_seconds = for_each(lambda index: timed(index, 1))
+    counts = for_each(iterations_of)
+    rates = [for_each(lambda index: counts[index] / timed(index, counts[index])) for _ in range(repeats)]
     return [
         failed[index] if index in failed else (statistics.median(rate[index] for rate in rates), compile_seconds[index])
         for index in range(len(runs))

@@ -1,1 +1,1 @@
-"""What `experiments.parity` compares with: Gymnasium's own environments, step by step and in distribution."""
+"""Our environments against Gymnasium's own, step by step and in distribution: the parts of `experiments.parity`."""

@@ -1,4 +1,4 @@
-"""Whether our episodes are drawn as Gymnasium's are: their starts, and their lengths and returns under one policy."""
+"""Distributions of ours against Gymnasium's: starts, and lengths and returns of episodes of one policy."""
 
 import warnings
 from typing import NamedTuple
@@ -16,26 +16,27 @@ from sqt_jax.types import Environment
 
 
 class Starts(NamedTuple):
-    """Positions and velocities at the start of episodes, in units of the task's noise; the worst entry of each."""
+    """Positions and velocities at the start of episodes, in units of the task's noise; the largest of all entries."""
 
     number: int
     mean: float  # |ours - theirs|
     std: float  # |ours / theirs - 1|
-    range: float  # |ours - theirs|, the larger one of both ends
+    range: float  # |ours - theirs|, the larger of both ends
     p_value: float  # of the Kolmogorov-Smirnov test, times the number of entries
 
 
 class Episodes(NamedTuple):
-    """Whole episodes under one policy of random weights, from each side's own starts."""
+    """Complete episodes of one policy with random weights, from each side's own starts."""
 
     number: int
-    our_lengths: np.ndarray
-    their_lengths: np.ndarray
+    our_lengths: np.ndarray  # [number]
+    their_lengths: np.ndarray  # [number]
     length_p_value: float  # of the Kolmogorov-Smirnov test
     return_p_value: float
 
 
 def compare_starts(name: str, count: int) -> Starts:
+    """Draws `count` starts of a task on each side; a `p_value` near 0 means that they differ."""
     task, env = TASKS[name], gymnasium_environment(name)
     keys = jax.random.split(jax.random.key(0), count)
     draws = jax.vmap(lambda key: gym_tasks.draw_start(task, env.model.qpos0, env.model.nv, key))(keys)
@@ -49,7 +50,7 @@ def compare_starts(name: str, count: int) -> Starts:
     theirs = (np.array(theirs) - rest) / task.noise
     p_values = [stats.ks_2samp(a, b).pvalue for a, b in zip(ours.T, theirs.T, strict=True)]
     ends = np.abs(np.stack([ours.min(0) - theirs.min(0), ours.max(0) - theirs.max(0)]))
-    # Velocities that are normal have no range.
+    # Normal velocities have no range.
     bounded = ends[:, : env.model.nq] if task.normal_velocity else ends
     return Starts(
         number=count,
@@ -61,11 +62,12 @@ def compare_starts(name: str, count: int) -> Starts:
 
 
 def compare_play(name: str, env: Environment, count: int) -> Episodes:
+    """Runs `count` episodes of a task on each side, ours in `env`; p-values near 0 mean that they differ."""
     size, actions = env.observation_size, env.action_size
     weights = np.random.default_rng(0).normal(size=(size, actions)).astype(np.float32) / np.sqrt(size)
     our_returns, our_lengths = evaluate_policy(lambda obs: jnp.tanh(obs @ weights), env, count)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium would have v4 be v5
+        warnings.simplefilter("ignore")  # Gymnasium recommends v5 instead of v4
         theirs = gymnasium.make(TASKS[name].gymnasium_id)
     their_returns, their_lengths = evaluate_policy(lambda obs: np.tanh(obs @ weights), theirs, count)
     return Episodes(
@@ -78,6 +80,7 @@ def compare_play(name: str, env: Environment, count: int) -> Episodes:
 
 
 def start_table(found: dict[str, Starts]) -> list[str]:
+    """A Markdown table, as lines: a row per task."""
     lines = ["| task | starts | mean | std | range | p |", "|---|---|---|---|---|---|"]
     for name, row in found.items():
         numbers = f"{row.mean:.3f} | {row.std:.3f} | {row.range:.3f} | {row.p_value:.2f}"
@@ -86,6 +89,7 @@ def start_table(found: dict[str, Starts]) -> list[str]:
 
 
 def play_table(found: dict[str, Episodes]) -> list[str]:
+    """A Markdown table, as lines: a row per task."""
     lines = ["| task | episodes | length here | in Gymnasium | p, lengths | p, returns |", "|---|---|---|---|---|---|"]
     for name, row in found.items():
         ours, theirs = (f"{x.mean():,.1f} ± {x.std(ddof=1):,.1f}" for x in (row.our_lengths, row.their_lengths))

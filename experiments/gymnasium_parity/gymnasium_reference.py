@@ -1,8 +1,9 @@
-"""What Gymnasium's own environments do: single steps from recorded states, and whole episodes."""
+"""Reference data of Gymnasium's own environments: single steps from recorded states, and complete episodes."""
 
 import warnings
 from typing import Any, NamedTuple
 
+import gymnasium
 import mujoco
 import numpy as np
 
@@ -10,21 +11,20 @@ from sqt_jax.envs import TASKS
 
 
 class Recorded(NamedTuple):
-    """One control step of MuJoCo C in float64 from some states of random rollouts, solver not warm-started."""
+    """One control step of MuJoCo C in float64 from N states of random rollouts, solver not warm-started."""
 
-    qpos: np.ndarray
-    qvel: np.ndarray
-    action: np.ndarray  # in [-1, 1]
-    first_obs: np.ndarray
-    obs: np.ndarray
-    reward: np.ndarray
-    terminated: np.ndarray
-    next_qvel: np.ndarray
+    qpos: np.ndarray  # [N, nq]
+    qvel: np.ndarray  # [N, nv]
+    action: np.ndarray  # [N, A] in [-1, 1]
+    first_obs: np.ndarray  # [N, O], before the step
+    obs: np.ndarray  # [N, O], after the step
+    reward: np.ndarray  # [N]
+    terminated: np.ndarray  # [N]
+    next_qvel: np.ndarray  # [N, nv]
 
 
 def gymnasium_environment(name: str) -> Any:
-    import gymnasium
-
+    """Gymnasium's environment of a task, without wrappers."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     with warnings.catch_warnings():
@@ -35,7 +35,7 @@ def gymnasium_environment(name: str) -> Any:
 
 
 def recorded(name: str, count: int) -> Recorded:
-    """Evenly spaced states of a random rollout, and up to eight whose next step terminates the episode."""
+    """`count` states of a task: evenly spaced ones of a random rollout, up to eight of which end their episode."""
     env = gymnasium_environment(name)
     generator = np.random.default_rng(0)
     scale = env.model.actuator_ctrlrange[:, 1]
@@ -57,24 +57,35 @@ def recorded(name: str, count: int) -> Recorded:
         env.set_state(qpos, qvel)
         first_obs = env._get_obs()
         obs, reward, terminated, *_ = env.step(action * scale)
-        rows.append((qpos, qvel, action, first_obs, obs, reward, terminated, env.data.qvel.copy()))
-    return Recorded(*(np.array(column) for column in zip(*rows, strict=True)))
+        rows.append(
+            Recorded(
+                qpos=qpos,
+                qvel=qvel,
+                action=action,
+                first_obs=first_obs,
+                obs=obs,
+                reward=reward,
+                terminated=terminated,
+                next_qvel=env.data.qvel.copy(),
+            )
+        )
+    return Recorded(*map(np.array, zip(*rows, strict=True)))
 
 
-class Episode(NamedTuple):
-    """A whole episode in Gymnasium from given (qpos, qvel), float32 numbers: what each of its steps gave."""
+class RecordedEpisode(NamedTuple):
+    """A complete episode in Gymnasium of T steps, from an initial state of float32 numbers."""
 
-    qpos: np.ndarray
-    qvel: np.ndarray
-    first_obs: np.ndarray
+    qpos: np.ndarray  # [nq], initial
+    qvel: np.ndarray  # [nv], initial
+    first_obs: np.ndarray  # [O]
     actions: np.ndarray  # [T, A] in [-1, 1]
     obs: np.ndarray  # [T, O]
     reward: np.ndarray  # [T]
     terminated: np.ndarray  # [T]
 
 
-def episode(name: str, seed: int, scale: float, steps: int = 1000) -> Episode:
-    """Random actions of a size in [-scale, scale] until the episode terminates."""
+def record_episode(name: str, seed: int, scale: float, steps: int = 1000) -> RecordedEpisode:
+    """An episode of random actions in [-scale, scale] until it terminates, of at most `steps` steps."""
     env = gymnasium_environment(name)
     env.reset(seed=seed)
     qpos, qvel = env.data.qpos.astype(np.float32), env.data.qvel.astype(np.float32)
@@ -86,8 +97,17 @@ def episode(name: str, seed: int, scale: float, steps: int = 1000) -> Episode:
     actions, rows = [], []
     for _ in range(steps):
         actions.append(generator.uniform(-scale, scale, env.model.nu).astype(np.float32))
-        obs, reward, terminated, *_ = env.step(actions[-1] * limit)
-        rows.append((obs, reward, terminated))
-        if terminated:
+        step = env.step(actions[-1] * limit)[:3]
+        rows.append(step)
+        if step[2]:
             break
-    return Episode(qpos, qvel, first_obs, np.array(actions), *(np.array(column) for column in zip(*rows, strict=True)))
+    obs, reward, terminated = (np.array(column) for column in zip(*rows, strict=True))
+    return RecordedEpisode(
+        qpos=qpos,
+        qvel=qvel,
+        first_obs=first_obs,
+        actions=np.array(actions),
+        obs=obs,
+        reward=reward,
+        terminated=terminated,
+    )

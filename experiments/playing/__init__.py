@@ -1,1 +1,1 @@
-"""A saved policy acting: state by state, in pictures, as a film or in a viewer."""
+"""Playing a saved policy: episodes state by state, pictures, films and MuJoCo's viewer."""

@@ -1,4 +1,4 @@
-"""Episodes of Brax's own environments as a page of HTML: Brax's viewer, which the browser fetches from Brax's site."""
+"""Episodes of Brax's own environments as a page of HTML with Brax's viewer, which the browser fetches."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,31 +10,31 @@ from sqt_jax.types import TimeStep
 
 
 class _Pose(NamedTuple):
-    """What Brax's viewer looks at of a state."""
+    """The part of a state that Brax's viewer uses."""
 
-    x: Any  # a brax.Transform: where the links are
+    x: Any  # a brax.Transform: the links' poses
 
 
 def poses(timestep: TimeStep) -> Any:
-    """For `episodes.play`'s `look`: where the links are, a `brax.Transform` of pos [L, 3] and rot [L, 4]."""
+    """For `episodes.play`'s `look`: the links' poses, a `brax.Transform` of pos [L, 3] and rot [L, 4]."""
     return timestep.state.task.pipeline_state.x
 
 
 def page(env: Any, shown: Sequence[Any]) -> bytes:
-    """Episodes one after another, in real time.
+    """The page, encoded: episodes one after another, in real time.
 
     Args:
       env: Brax's own environment (`brax_envs.brax_own`).
-      shown: of each episode what `poses` gave of its states, [T, ...].
+      shown: the `poses` of each episode, [T, ...].
     """
-    from brax.io import html
+    from brax.io import html  # only here: it imports all of Brax
 
     states = [
         _Pose(jax.tree.map(lambda x, t=t: np.asarray(x[t]), episode))
         for episode in shown
         for t in range(len(episode.pos))
     ]
-    # The viewer expects one state for each of the simulator's steps, of which a control step has several.
+    # The viewer expects one state per simulator step; a control step has several of them.
     system = env.sys.tree_replace({"opt.timestep": float(env.dt)})
-    # the whole window: a height that is a number has no unit there, and counts for nothing
+    # full window height; the viewer ignores a number, which has no unit
     return html.render(system, states, height="100vh", colab=False).encode()

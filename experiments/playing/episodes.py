@@ -1,4 +1,4 @@
-"""Episodes of a policy, state by state: what they reached, and what a film of them shows."""
+"""Episodes of a policy, state by state: their returns, and the states for a film."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,19 +10,21 @@ import numpy as np
 from sqt_jax import rollout
 from sqt_jax.types import Array, Environment, TimeStep
 
-CHUNK = 50  # steps of one call: few enough for a live line, enough that a call costs nothing
+CHUNK = 50  # steps per call: few enough for a live line, enough to make the calls' cost negligible
 
 
 class Episode(NamedTuple):
-    shown: Any  # a pytree of [T, ...]: what `look` gave of each state in which the policy acted
+    """One episode of T steps."""
+
+    shown: Any  # a pytree of [T, ...]: `look` of each state in which the policy acted
     total: float  # the undiscounted return
     length: int  # T
     terminated: bool  # by the task
-    truncated: bool  # by its time limit; where neither: cut off by `max_steps`
+    truncated: bool  # by its time limit; if neither: cut off by `max_steps`
 
 
 class _Running(NamedTuple):
-    number: Array  # [] int32: steps made
+    number: Array  # [] int32: steps so far
     timestep: TimeStep  # [E, ...]
     running: Array  # [E] bool
     totals: Array  # [E]
@@ -40,13 +42,14 @@ def play(
     max_steps: int | None = None,
     watch: Callable[[int], None] = lambda steps: None,
 ) -> list[Episode]:
-    """Runs episodes side by side from the starts that `evaluate` has with this key, each to its own end.
+    """Runs E episodes in parallel, each to its own end, from the same starts as `evaluate` with this key.
 
     Args:
       policy: obs [E, O] -> action [E, A] in [-1, 1].
-      look: time step of one environment -> what is kept of it, a pytree of arrays.
-      max_steps: cuts episodes off; None leaves them the environment's length.
-      watch: told now and then how many steps each of the episodes has made at most.
+      look: time step of one environment -> a pytree of arrays to keep.
+      num_episodes: E.
+      max_steps: cuts episodes off; None is the environment's time limit.
+      watch: called after each chunk with the steps of the longest episode so far.
     """
     limit = min(max_steps or env.episode_length, env.episode_length)
 
@@ -57,21 +60,28 @@ def play(
         number = state.number + 1
         ended = following.terminated | following.truncated | (number >= limit)
         made = _Running(
-            number,
-            following,
-            running & ~ended,
-            state.totals + jnp.where(running, transition.reward, 0.0),
-            state.lengths + running,
-            state.terminated | (running & following.terminated),
-            state.truncated | (running & following.truncated),
+            number=number,
+            timestep=following,
+            running=running & ~ended,
+            totals=state.totals + jnp.where(running, transition.reward, 0.0),
+            lengths=state.lengths + running,
+            terminated=state.terminated | (running & following.terminated),
+            truncated=state.truncated | (running & following.truncated),
         )
         return made, shown
 
     part = jax.jit(lambda state: jax.lax.scan(body, state, length=min(CHUNK, limit)))
-    no = jnp.zeros(num_episodes, bool)
+    none = jnp.zeros(num_episodes, bool)
     timestep = jax.jit(lambda key: rollout.reset(env, key, num_episodes))(key)
-    nothing = jnp.zeros(num_episodes), jnp.zeros(num_episodes, jnp.int32)
-    state = _Running(jnp.zeros((), jnp.int32), timestep, ~no, *nothing, no, no)
+    state = _Running(
+        number=jnp.zeros((), jnp.int32),
+        timestep=timestep,
+        running=~none,
+        totals=jnp.zeros(num_episodes),
+        lengths=jnp.zeros(num_episodes, jnp.int32),
+        terminated=none,
+        truncated=none,
+    )
     parts = []
     while bool(state.running.any()):
         state, shown = part(state)
@@ -80,11 +90,11 @@ def play(
     shown = jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
     return [
         Episode(
-            jax.tree.map(lambda x, i=i, length=length: x[:length, i], shown),
-            float(state.totals[i]),
-            int(length),
-            bool(state.terminated[i]),
-            bool(state.truncated[i]),
+            shown=jax.tree.map(lambda x, i=i, length=length: x[:length, i], shown),
+            total=float(state.totals[i]),
+            length=int(length),
+            terminated=bool(state.terminated[i]),
+            truncated=bool(state.truncated[i]),
         )
         for i, length in enumerate(np.asarray(state.lengths))
     ]

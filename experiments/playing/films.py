@@ -12,44 +12,40 @@ from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
+from PIL import Image
 
+from experiments.playing.film_formats import format_of
 from experiments.running import files
 
-FORMATS = ("mp4", "gif", "html")
-MOST_FRAMES = 60  # a second: screens show no more
-# The delay between a GIF's pictures is in 1/100 s, and browsers slow down those below 2.
+MAX_RATE = 60  # pictures per second: screens show no more
+# The delay between a GIF's pictures is a multiple of 1/100 s, and browsers slow down delays below 2/100 s.
 GIF_UNIT, GIF_LEAST = Fraction(1, 100), 2
-QUALITY = 18  # x264's rate factor: 0 is lossless, 23 its default; from about 18 down nobody sees a difference
-
-
-def format_of(path: Path) -> str:
-    """The format that a file's name asks for. Raises `ValueError` where it is none of `FORMATS`."""
-    suffix = path.suffix.lower().removeprefix(".")
-    if suffix not in FORMATS or not path.stem:
-        raise ValueError(f"expects a file with the ending {', '.join(f'.{name}' for name in FORMATS)}")
-    return suffix
+QUALITY = 18  # x264's rate factor: 0 is lossless, 23 its default; the loss is invisible up to about 18
 
 
 def stride(period: float, name: str) -> int:
-    """Of states that are `period` seconds apart, each how many-th is shown so that the film runs in real time."""
+    """N, for a film of format `name` in real time that shows every N-th of states `period` seconds apart."""
     exact = _fraction(period)
     if name != "gif":
-        return math.ceil(1 / (MOST_FRAMES * exact))
+        return math.ceil(1 / (MAX_RATE * exact))
     least = math.ceil(GIF_LEAST * GIF_UNIT / exact)
-    whole = [k for k in range(least, 10 * least) if (k * exact / GIF_UNIT).denominator == 1]
-    return next(iter(whole), least)
+    exact_delays = [k for k in range(least, 10 * least) if (k * exact / GIF_UNIT).denominator == 1]
+    return next(iter(exact_delays), least)
 
 
 def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str = "") -> bytes:
-    """A film of pictures [H, W, 3] uint8, all of one size (even numbers), that are shown for `period` seconds each.
+    """The bytes of a film.
 
     Args:
-      name: one of `FORMATS`.
-      caption: shown by a page of HTML.
+      frames: pictures [H, W, 3] uint8 of one size, H and W even.
+      period: seconds that each is shown.
+      name: one of `film_formats.FORMATS`.
+      caption: shown on a page of HTML.
 
     Raises:
-      ValueError: there are no pictures, or not of such a size.
+      ValueError: there are no pictures, or H or W is odd.
       OSError: the film cannot be encoded.
     """
     pictures = iter(frames)
@@ -58,7 +54,7 @@ def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str 
         raise ValueError("a film needs a picture")
     height, width, _ = first.shape
     if height % 2 or width % 2:
-        raise ValueError(f"a film expects even numbers of pixels, not {width}x{height}")
+        raise ValueError(f"a film needs even numbers of pixels, not {width}x{height}")
     pictures = chain([first], pictures)
     if name == "gif":
         return _gif(pictures, period)
@@ -67,31 +63,32 @@ def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str 
 
 
 def write(path: Path, frames: Iterable[np.ndarray], period: float, caption: str = "") -> int:
-    """Writes a film in the format of the file's name, whole or not at all; its bytes. Raises as `encode`."""
+    """Writes a film in the format of the file's ending, completely or not at all; returns its size in bytes.
+
+    Raises as `encode`.
+    """
     content = encode(frames, period, format_of(path), caption)
     with files.whole_file(path) as file:
         return file.write(content)
 
 
 def _mp4(frames: Iterable[np.ndarray], size: Sequence[int], period: float) -> bytes:
-    from imageio_ffmpeg import get_ffmpeg_exe
-
     try:
-        command = [get_ffmpeg_exe(), "-v", "error"]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error"]
     except RuntimeError:
-        raise OSError("imageio-ffmpeg brings no ffmpeg for this machine") from None
+        raise OSError("imageio-ffmpeg has no ffmpeg for this machine") from None
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(1 / _fraction(period))]
     command += ["-i", "-", "-an", "-vcodec", "libx264", "-crf", str(QUALITY), "-pix_fmt", "yuv420p"]
     command += ["-movflags", "+faststart", "film.mp4"]  # the index first, so that a film plays while it loads
     with tempfile.TemporaryDirectory() as folder, Path(folder, "errors").open("wb") as errors:
-        # Not by imageio_ffmpeg.write_frames, which forks: JAX's threads do not bear that. A session of its own, so that
-        # Ctrl-C is this process's alone.
+        # Not imageio_ffmpeg.write_frames: it forks, which is unsafe with JAX's threads. A session of its own, so that
+        # Ctrl-C reaches only this process.
         process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.PIPE, stdout=errors, stderr=errors, start_new_session=True
         )
         assert process.stdin is not None
         try:
-            with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # where it has ended, its exit code tells
+            with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # if it has ended, see its exit code
                 for frame in frames:
                     pipe.write(np.ascontiguousarray(frame, np.uint8).data)
         except BaseException:
@@ -100,14 +97,12 @@ def _mp4(frames: Iterable[np.ndarray], size: Sequence[int], period: float) -> by
         finally:
             process.wait()
         if process.returncode:
-            said = Path(folder, "errors").read_text(errors="replace")
-            raise OSError(f"ffmpeg: {' '.join(said.split())[:300]}")
+            text = Path(folder, "errors").read_text(errors="replace")
+            raise OSError(f"ffmpeg: {' '.join(text.split())[:300]}")
         return Path(folder, "film.mp4").read_bytes()
 
 
 def _gif(frames: Iterable[np.ndarray], period: float) -> bytes:
-    from PIL import Image
-
     images = (Image.fromarray(frame) for frame in frames)
     stream = io.BytesIO()
     milliseconds = round(1000 * period)
@@ -132,5 +127,5 @@ def _page(film: bytes, size: Sequence[int], caption: str) -> bytes:
 
 
 def _fraction(period: float) -> Fraction:
-    """The seconds that were meant: 1/20, not the float next to it."""
+    """The seconds as a simple fraction: 1/20, not the float next to it."""
     return Fraction(period).limit_denominator(1_000_000)

@@ -1,14 +1,14 @@
-"""Which OpenGL MuJoCo renders with here. Nothing here imports MuJoCo, which decides that when it is imported."""
+"""The OpenGL implementation that MuJoCo renders with. Does not import MuJoCo, which reads MUJOCO_GL when imported."""
 
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
 
-OFF_SCREEN = ("egl", "osmesa")  # what needs no display, the faster one first
+OFF_SCREEN = ("egl", "osmesa")  # need no display; the faster one first
 PROBE_SECONDS = 60
 
-# A sphere in front of the camera: a context that cannot draw it is of no use.
+# Draws a sphere in front of the camera: a context that opens may still draw nothing.
 PROBE = """
 import mujoco
 ball = "<mujoco><worldbody><light pos='0 0 3'/><geom size='1' rgba='1 1 1 1'/></worldbody></mujoco>"
@@ -22,13 +22,13 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 
 
 class NoGraphics(Exception):
-    """Nothing can render here; the text says what to install."""
+    """No OpenGL implementation works; the text says what to install."""
 
 
 def works(name: str) -> bool:
     """Whether MuJoCo can render with `MUJOCO_GL=name` (empty: its own choice).
 
-    Asked in a process of its own: an attempt that fails can crash the process, or spoil it for the next one.
+    Tried in a process of its own: a failed attempt can crash a process, or break later attempts in it.
     """
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
     environment |= {"MUJOCO_GL": name} if name else {}
@@ -42,17 +42,17 @@ def works(name: str) -> bool:
 
 
 def has_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
-    """Whether a window can be hoped for: X11 or Wayland on Linux, always elsewhere."""
+    """Whether a window may open: with X11 or Wayland on Linux, always on other systems."""
     return not platform.startswith("linux") or any(environment.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def choose(
     environment: Mapping[str, str] = os.environ, platform: str = sys.platform, works: Callable[[str], bool] = works
 ) -> str:
-    """A value for MUJOCO_GL that works here; empty where MuJoCo's own choice does. The user's own is not departed from.
+    """A value for MUJOCO_GL that works; empty if MuJoCo's own choice works. A value set by the user is kept.
 
     Raises:
-      NoGraphics: there is none.
+      NoGraphics: none works.
     """
     if named := environment.get("MUJOCO_GL", "").strip():
         if works(named):
@@ -66,10 +66,10 @@ def choose(
         if works(name):
             return name
     tried = ", ".join(filter(None, candidates)) or "MuJoCo's own"
-    raise NoGraphics(f"no OpenGL works here to render with (tried: {tried}); {_advice(platform)}")
+    raise NoGraphics(f"no OpenGL works here for rendering (tried: {tried}); {_advice(platform)}")
 
 
 def _advice(platform: str) -> str:
     if platform.startswith("linux"):
-        return "apt-get install libosmesa6 (or libegl1, for a GPU with its driver) brings one"
-    return "rendering needs a session with graphics"
+        return "apt-get install libosmesa6 (or libegl1, for a GPU with its driver) installs one"
+    return "rendering needs a graphical session"

@@ -1,4 +1,4 @@
-"""The policy of one member of a run: which member, and loading it for an environment."""
+"""Choosing a member of a run, and loading its policy."""
 
 import json
 import math
@@ -16,13 +16,15 @@ MAX_SUMMARY_BYTES = 100_000_000
 
 
 class Chosen(NamedTuple):
+    """The member to play."""
+
     number: int  # of the member in its run, from 0
     member: Member
-    why: str  # it was chosen, in words
+    why: str  # the reason of the choice, in words
 
 
 def read(path: Path) -> Described:
-    """The run in a folder. Raises `UsageError` where there is none."""
+    """The run in a folder. Raises `UsageError` if there is none."""
     try:
         return run_config.read(path)
     except run_config.NotDescribed as error:
@@ -30,7 +32,7 @@ def read(path: Path) -> Described:
 
 
 def final_returns(path: Path, count: int) -> list[float]:
-    """The return of each member at the run's last evaluation; NaN where summary.json does not tell."""
+    """The return of each of `count` members at the run's last evaluation; NaN if summary.json does not have it."""
     returns = [math.nan] * count
     try:
         for entry in files.read_json(path / "summary.json", MAX_SUMMARY_BYTES)["members"]:
@@ -42,10 +44,10 @@ def final_returns(path: Path, count: int) -> list[float]:
 
 
 def choose(run: Described, returns: Sequence[float], seed: int | None = None, number: int | None = None) -> Chosen:
-    """The member that is asked for: by its number, or of those with that seed (of all) the best.
+    """The member with this number, or the best with this seed, or the best of all.
 
     Args:
-      returns: of each member, by which the best is found; NaN where it is not known.
+      returns: of each member, to find the best; NaN if unknown.
 
     Raises:
       UsageError: the run has no such member.
@@ -55,9 +57,8 @@ def choose(run: Described, returns: Sequence[float], seed: int | None = None, nu
         if number >= len(members):
             raise UsageError(f"--member={number}: expects one of the run's members, 0 to {len(members) - 1}")
         if seed not in (None, members[number].seed):
-            raise UsageError(
-                f"--seed={seed}: member {number} has seed {members[number].seed}; expects --seed or --member"
-            )
+            own = members[number].seed
+            raise UsageError(f"--seed={seed}: member {number} has seed {own}; expects only one of --seed and --member")
         return Chosen(number, members[number], f"of {len(members)}")
     found = [i for i, member in enumerate(members) if seed in (None, member.seed)]
     if not found:
@@ -75,8 +76,8 @@ def choose(run: Described, returns: Sequence[float], seed: int | None = None, nu
     return Chosen(best, members[best], why)
 
 
-def told(run: Described, chosen: Chosen) -> str:
-    """What is played, in a line."""
+def caption(run: Described, chosen: Chosen) -> str:
+    """One line: algorithm, environment, member, seed, values of the swept settings, and the reason of the choice."""
     config = chosen.member.config
     values = "".join(f", {name} {getattr(config.agent, name):g}" for name in run.swept)
     return f"{config.algo} on {config.env}: member {chosen.number}, seed {chosen.member.seed}{values} ({chosen.why})"
@@ -86,7 +87,7 @@ def load(path: Path, chosen: Chosen, env: Environment) -> Callable[[Array], Arra
     """The deterministic policy of a member of the run in `path`: obs [B, O] -> action [B, A] in [-1, 1].
 
     Raises:
-      UsageError: it is not there, damaged, or not of this environment's sizes.
+      UsageError: it is missing, damaged, or has other sizes than the environment.
     """
     folder = path / "policy"
     if not folder.is_dir():
@@ -102,7 +103,7 @@ def load(path: Path, chosen: Chosen, env: Environment) -> Callable[[Array], Arra
 
 
 def _sizes(folder: Path) -> tuple[Any, Any]:
-    """Of observations and actions; `load_policy` has read the same file and found it good."""
+    """Observation and action size; `load_policy` has checked the same file."""
     settings = json.loads((folder / "config.json").read_bytes())
     return settings["observation_size"], settings["action_size"]
 

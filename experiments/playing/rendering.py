@@ -1,6 +1,6 @@
-"""Pictures of a MuJoCo model in given configurations, drawn off screen.
+"""Off-screen pictures of a MuJoCo model in given configurations.
 
-Which OpenGL draws is decided when MuJoCo is imported: set MUJOCO_GL before (`graphics.choose`).
+MuJoCo chooses OpenGL's implementation when it is imported: set MUJOCO_GL before (`graphics.choose`).
 """
 
 import copy
@@ -11,8 +11,8 @@ import numpy as np
 
 TRACKING = "track"  # the camera that follows the robot, in the models of Gymnasium's locomotion tasks
 
-DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees, of a camera of our own: from where Gymnasium's look
-SHADOW_TEXELS = 1024  # as fine as the pictures are; MuJoCo's 4096 double the time that software expects to draw one
+DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees of our own camera, as of Gymnasium's
+SHADOW_TEXELS = 1024  # as fine as the pictures; MuJoCo's 4096 double the time of software rendering
 
 
 def cameras(model: mujoco.MjModel) -> list[str]:
@@ -23,7 +23,7 @@ def cameras(model: mujoco.MjModel) -> list[str]:
 def frames(
     model: mujoco.MjModel, configurations: Iterable[np.ndarray], size: Sequence[int] = (640, 480), camera: str = ""
 ) -> Iterator[np.ndarray]:
-    """One picture [height, width, 3] uint8 of each configuration qpos [nq]; each is an array of its own.
+    """One picture [height, width, 3] uint8 per configuration qpos [nq]; each is a new array.
 
     Args:
       size: width and height in pixels.
@@ -47,7 +47,11 @@ def frames(
 
 
 def view_of(model: mujoco.MjModel, camera: str = "") -> mujoco.MjvCamera:
-    """MuJoCo's description of a camera of this name; see `frames`."""
+    """MuJoCo's description of the camera with this name, as in `frames`.
+
+    Raises:
+      ValueError: the model has no such camera.
+    """
     names = cameras(model)
     view = mujoco.MjvCamera()
     if camera and camera not in names:
@@ -60,8 +64,8 @@ def view_of(model: mujoco.MjModel, camera: str = "") -> mujoco.MjvCamera:
 
 
 def following(model: mujoco.MjModel, view: mujoco.MjvCamera) -> mujoco.MjvCamera:
-    """Makes `view` one that follows the robot and can be turned by hand."""
-    mujoco.mjv_defaultFreeCamera(model, view)  # from as far as the whole floor is wide
+    """Changes `view` to a camera that follows the robot and can be turned by hand; returns it."""
+    mujoco.mjv_defaultFreeCamera(model, view)  # its distance is the width of the floor
     view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
     view.trackbodyid = min(1, model.nbody - 1)
     view.distance, view.elevation = DISTANCE, ELEVATION

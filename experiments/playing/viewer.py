@@ -1,4 +1,4 @@
-"""MuJoCo's own window, playing episodes in real time until it is closed."""
+"""MuJoCo's viewer, playing episodes in real time until its window is closed."""
 
 import threading
 import time
@@ -22,20 +22,22 @@ def show(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Shows episodes one after another, and then again from the first, until the user closes the window.
+    """Shows episodes one after another, in a loop, until the user closes the window.
 
     Args:
       episodes: qpos [T, nq] and qvel [T, nv] of each.
       period: seconds between two states.
-      camera: the name of one of the model's; empty: one that follows the robot and can be turned by hand.
+      camera: the name of one of the model's cameras; empty: one that follows the robot and can be turned by hand.
       launch: opens the window; None is `mujoco.viewer.launch_passive`.
+      clock: seconds.
+      sleep: waits for a number of seconds.
 
     Raises:
-      RuntimeError: there cannot be a window (on macOS: python was not started as `mjpython`).
+      RuntimeError: a window cannot be opened (on macOS: python was not started as `mjpython`).
       ValueError: the model has no such camera.
     """
     if launch is None:
-        from mujoco import viewer  # it brings GLFW
+        from mujoco import viewer  # only here: it loads GLFW
 
         launch = viewer.launch_passive
     view = rendering.view_of(model, camera) if camera else rendering.following(model, mujoco.MjvCamera())
@@ -44,7 +46,7 @@ def show(
         with launch(model, mujoco.MjData(model), show_left_ui=False, show_right_ui=False) as window:
             _run(window, view, episodes, period, clock, sleep)
     finally:
-        # The window is told to close, and closes in a thread of its own: it must not draw when the process ends.
+        # The window closes in a thread of its own, which must have ended before the process does.
         for thread in set(threading.enumerate()) - others:
             thread.join(CLOSING_SECONDS)
 

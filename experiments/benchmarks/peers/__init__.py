@@ -1,5 +1,5 @@
-"""Other people's projects, and TD7 in PyTorch, measured beside this one (`python -m experiments.bench --compare`).
+"""Programs of other implementations, and TD7 in PyTorch, for `python -m experiments.bench --compare`.
 
-Each is a program of its own, run by an interpreter that has what it needs. It prints "ready" when it has compiled,
-reads numbers of steps line by line, and prints "done" when it has made them. It imports nothing of this project.
+Each program runs in an interpreter that has its packages, and imports nothing of this project. It prints "ready" when
+it has compiled, reads a number of steps per line, and prints "done" when it has made them.
 """

@@ -23,6 +23,7 @@ COMMON = {
 
 
 def make(algo: str, task: str, seed: int) -> sbx.TD3 | sbx.SAC:
+    """SBX's agent with the settings of ours: `algo` is td3 or sac, `task` a Gymnasium id."""
     env = gymnasium.make(task)
     if algo == "sac":
         return sbx.SAC("MlpPolicy", env, seed=seed, ent_coef=0.2, **COMMON)
@@ -32,6 +33,7 @@ def make(algo: str, task: str, seed: int) -> sbx.TD3 | sbx.SAC:
 
 
 def main(algo: str, task: str, seed: str) -> None:
+    """Trains as many steps as each line of stdin says."""
     warnings.simplefilter("ignore")
     model = make(algo, task, int(seed))
     model.learn(LEARNING_STARTS + 50)

@@ -1,8 +1,8 @@
 """TD7's update in PyTorch, built as its authors' code is: `python torch_td7.py OBSERVATIONS ACTIONS DEVICE SEED`.
 
 One agent, a fixed batch of 256, networks of (256, 256) and embeddings of 256, the actor every second update, copies
-every 250: https://arxiv.org/abs/2306.02451. Two critics are one module, as there. DEVICE is cpu or cuda, which the
-authors take where it is; on a CPU, `experiments.benchmarks.compare` says by OMP_NUM_THREADS how many threads compute.
+every 250: https://arxiv.org/abs/2306.02451. Two critics are one module, as there. DEVICE is cpu or cuda; on a CPU, the
+benchmark sets the number of threads by OMP_NUM_THREADS.
 """
 
 import copy
@@ -16,10 +16,13 @@ BATCH, WIDTH, GAMMA, MIN_PRIORITY, PERIOD = 256, 256, 0.99, 1.0, 250
 
 
 def avg_l1_norm(x: torch.Tensor) -> torch.Tensor:
+    """x [..., D] divided by the mean of |x| over D."""
     return x / x.abs().mean(-1, keepdim=True).clamp(min=1e-8)
 
 
 class Encoder(nn.Module):
+    """Embeddings of states, zs [B, 256], and of states with actions, zsa [B, 256]."""
+
     def __init__(self, observations: int, actions: int):
         super().__init__()
         self.state = nn.ModuleList([nn.Linear(observations, WIDTH), nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)])
@@ -36,6 +39,8 @@ class Encoder(nn.Module):
 
 
 class Actor(nn.Module):
+    """obs [B, O], zs -> action [B, A] in [-1, 1]."""
+
     def __init__(self, observations: int, actions: int):
         super().__init__()
         self.first = nn.Linear(observations, WIDTH)
@@ -48,6 +53,8 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
+    """obs [B, O], action [B, A], zsa, zs -> value [B, 1]."""
+
     def __init__(self, observations: int, actions: int):
         super().__init__()
         self.first = nn.Linear(observations + actions, WIDTH)
@@ -59,6 +66,8 @@ class Critic(nn.Module):
 
 
 class Critics(nn.Module):
+    """Two critics -> values [B, 2]."""
+
     def __init__(self, observations: int, actions: int):
         super().__init__()
         self.each = nn.ModuleList([Critic(observations, actions), Critic(observations, actions)])
@@ -68,6 +77,8 @@ class Critics(nn.Module):
 
 
 class TD7:
+    """An agent with its optimizers and target networks."""
+
     def __init__(self, observations: int, actions: int, device: str):
         self.encoder = Encoder(observations, actions).to(device)
         self.actor = Actor(observations, actions).to(device)
@@ -80,6 +91,7 @@ class TD7:
         self.lowest, self.highest = 1e8, -1e8
 
     def update(self, obs, action, reward, next_obs, discount) -> torch.Tensor:
+        """One update on a batch, reward and discount [B, 1]; returns the priorities [B]."""
         encoder_optimizer, actor_optimizer, critic_optimizer = self.optimizers
         self.updates += 1
         with torch.no_grad():
@@ -115,12 +127,14 @@ class TD7:
         return error.detach().max(1)[0].clamp(min=MIN_PRIORITY) ** 0.4
 
     def step(self, optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
+        """One gradient step."""
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
 
 def main(observation_size: str, action_size: str, device: str, seed: str) -> None:
+    """Makes as many updates as each line of stdin says."""
     observations, actions = int(observation_size), int(action_size)
     torch.manual_seed(int(seed))
     agent = TD7(observations, actions, device)

@@ -1,0 +1,65 @@
+"""The environment that a run's policy plays in, and its model to show."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from experiments.commandline.arguments import UsageError
+from experiments.playing import brax_pages, episodes, rendering
+from experiments.playing.play_flags import is_brax
+from sqt_jax import envs
+from sqt_jax.config import Config
+from sqt_jax.envs import brax_envs, gym_tasks
+from sqt_jax.types import Environment, TimeStep
+
+
+class PlayedTask(NamedTuple):
+    """An environment to play in, and what its film needs."""
+
+    env: Environment
+    physics: str
+    period: float  # seconds per control step
+    look: Callable[[TimeStep], Any]  # what is kept of a state, as in `episodes.play`
+    scene: Any  # a mujoco.MjModel; for brax:ENV Brax's own environment
+
+
+def make_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
+    """The environment that a member was trained on.
+
+    Args:
+      config: of the member.
+      physics: None is `mujoco`, and for brax:ENV the run's.
+      camera: the name of one of the model's cameras, or empty.
+
+    Raises:
+      UsageError: the task has no such physics or camera, or a package for the physics is missing.
+    """
+    brax = is_brax(config.env)
+    physics = physics or (config.physics if brax else "mujoco")
+    if physics not in envs.simulators(config.env):
+        raise UsageError(f"--physics={physics}: expects one of {', '.join(envs.simulators(config.env))}")
+    if missing := envs.lacks(physics):
+        raise UsageError(f"--physics={physics}: needs {missing}")
+    if brax:
+        if camera:
+            raise UsageError(f"--camera={camera}: Brax's viewer has its own; expects no camera with {config.env}")
+        own = brax_envs.brax_own(config.env, physics)
+        return PlayedTask(
+            env=envs.make(config.env, physics),
+            physics=physics,
+            period=float(own.dt),
+            look=brax_pages.poses,
+            scene=own,
+        )
+    row = envs.TASKS[config.env]
+    model = gym_tasks.load_model(row)
+    try:
+        rendering.view_of(model, camera)
+    except ValueError as error:
+        raise UsageError(f"--camera={camera}: {error}") from None
+    return PlayedTask(
+        env=envs.make(config.env, physics),
+        physics=physics,
+        period=model.opt.timestep * row.frame_skip,
+        look=episodes.configuration,
+        scene=model,
+    )

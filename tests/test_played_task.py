@@ -1,0 +1,32 @@
+"""The environment to play in: the run's task, on the physics that the flags name."""
+
+import mujoco
+import pytest
+
+from experiments.commandline.arguments import UsageError
+from experiments.playing.played_task import make_task
+from sqt_jax.algorithms import make_config
+from sqt_jax.envs import physics
+
+HOPPER = make_config("td3", "hopper")
+
+
+def test_a_task_is_played_on_mujoco_by_default():
+    task = make_task(HOPPER, None, "")
+    assert (task.env.name, task.physics) == ("hopper", "mujoco") and task.period == pytest.approx(0.008)
+    assert isinstance(task.scene, mujoco.MjModel)
+    assert make_task(HOPPER, "mjx", "track").physics == "mjx"
+
+
+@pytest.mark.parametrize(
+    ("asked", "camera", "says"),
+    [
+        ("spring", "", "--physics=spring: expects one of mjx, mujoco, warp"),
+        ("warp", "", "--physics=warp: needs a part"),
+        (None, "side", "--camera=side: expects one of track"),
+    ],
+)
+def test_other_physics_and_cameras_are_rejected(asked, camera, says, monkeypatch):
+    monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
+    with pytest.raises(UsageError, match=says):
+        make_task(HOPPER, asked, camera)
