@@ -37,7 +37,7 @@ def command(argv: Sequence[str]) -> None:
     from experiments.evidence import figures, pooling  # these and what they bring take a second or two
 
     runs = pooling.collect(options.runs)
-    draw = figures.every(runs, options.statistic)
+    draw = figures.all_figures(runs, options.statistic)
     arguments.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
     drawn = {name: function() for name, function in draw.items()}
     contents = {

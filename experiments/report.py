@@ -36,14 +36,14 @@ def parser() -> Parser:
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
     arguments.refuse_file("--out", options.out, options.overwrite)
-    from experiments.evidence import figures, page, paper_tables, pooling, run_details
+    from experiments.evidence import figures, page, paper_tables, pooling, run_details, task_sizes
     from experiments.running import run_config  # they take a second or two
 
     runs = pooling.collect(options.runs)
     content = page.Content(
         runs,
-        paper_tables.make_tables(runs, options.reference, paper_tables.task_sizes(runs)),
-        {name: draw() for name, draw in figures.every(runs, options.statistic).items()},
+        paper_tables.make_tables(runs, options.reference, task_sizes.read_sizes(runs)),
+        {name: draw() for name, draw in figures.all_figures(runs, options.statistic).items()},
         run_details.read_all(runs),
         datetime.now(UTC),
         f"sqt_jax {run_config.versions()['sqt_jax'] or 'of an unknown version'}",

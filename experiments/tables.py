@@ -34,13 +34,18 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    from experiments.evidence import formats, paper_tables, pooling  # these and what they bring take a second or two
+    from experiments.evidence import (  # these and what they bring take a second or two
+        formats,
+        paper_tables,
+        pooling,
+        task_sizes,
+    )
 
     runs = pooling.collect(options.runs)
     if options.out:
         names = [f"{name}.{suffix}" for name in paper_tables.NAMES for suffix, _ in formats.FORMATS.values()]
         arguments.refuse_existing(options.out, names, options.overwrite)
-    tables = paper_tables.make_tables(runs, options.reference, paper_tables.task_sizes(runs))
+    tables = paper_tables.make_tables(runs, options.reference, task_sizes.read_sizes(runs))
     if options.out:
         contents = {
             f"{table.name}.{suffix}": write(table).encode()

@@ -15,7 +15,7 @@ def content_of(folder, reference=False):
     return Content(
         runs,
         paper_tables.make_tables(runs, reference),
-        {name: draw() for name, draw in figures.every(runs, "iqm").items()},
+        {name: draw() for name, draw in figures.all_figures(runs, "iqm").items()},
         run_details.read_all(runs),
         datetime(2026, 1, 2, 3, 4, tzinfo=UTC),
         "sqt_jax 1.2.3",
@@ -60,7 +60,7 @@ def test_everything_is_there_in_its_order(tmp_path):
         "How the runs ended: 2 not ended.",
         "Not everything is complete",
         "Table 2: maximum average return",
-        "Table 2, SQT against its base",
+        "Table 2, SQT variants against their baselines",
         "Table 3",
         "Seeds",
         "Figure 1: Return of an evaluation episode",

@@ -1,4 +1,4 @@
-"""Finished runs on disk: found in and below folders, and read, a `Curves` for each seed."""
+"""Finished runs on disk: found in and below folders, and read, a `MemberCurves` for each seed."""
 
 import csv
 import math
@@ -14,7 +14,7 @@ from experiments.commandline.arguments import UsageError, printable
 REQUIRED = ("member", "env_steps", "gradient_steps", "seed", "return_mean", "q_std")
 
 
-class Curves(NamedTuple):
+class MemberCurves(NamedTuple):
     """What one seed left."""
 
     run: Path
@@ -64,7 +64,7 @@ def _below(path: Path) -> tuple[list[Path], list[Path]]:
     return runs, without
 
 
-def read_run(path: Path) -> list[Curves]:
+def read_run(path: Path) -> list[MemberCurves]:
     """The members of a run that have an evaluation. Raises `UsageError` where its files cannot be understood."""
     from experiments.running import run_config  # brings JAX
 
@@ -97,7 +97,7 @@ def read_run(path: Path) -> list[Curves]:
         # Of a member that had diverged by then; runs of an earlier version wrote its frozen critics' values.
         gone = np.isnan(own["return_mean"])
         own |= {name: np.where(gone, np.nan, own[name]) for name in ("q_mean", "q_std", "value_bias") if name in own}
-        found.append(Curves(path, member.seed, settings, versions, own))
+        found.append(MemberCurves(path, member.seed, settings, versions, own))
     if not set(columns["member"]) <= set(range(len(run.members))):
         raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that its config.json has not")
     return found

@@ -1,4 +1,4 @@
-"""`cells.Table` as terminal output, markdown, CSV and LaTeX."""
+"""`cells.ResultTable` as terminal output, markdown, CSV and LaTeX."""
 
 import csv
 import io
@@ -8,10 +8,10 @@ from collections.abc import Callable
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.padding import Padding
-from rich.table import Table as RichTable
+from rich.table import Table
 from rich.text import Text
 
-from experiments.evidence.cells import Cell, Table
+from experiments.evidence.cells import Cell, ResultTable
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -24,9 +24,9 @@ LATEX = {
 } | {character: f"\\{character}" for character in "&%$#_{}"}
 
 
-def rich_table(table: Table) -> Group:
+def rich_table(table: ResultTable) -> Group:
     """For a console of rich."""
-    shown = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
+    shown = Table(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
     for name in table.header:
         shown.add_column(name, overflow="fold")
     for lines in table.sections:
@@ -38,14 +38,14 @@ def rich_table(table: Table) -> Group:
     return Group(shown, *(Padding(text, (0, 2)) for text in below), Text(""))
 
 
-def terminal(table: Table, width: int = 200) -> str:
+def terminal(table: ResultTable, width: int = 200) -> str:
     """As plain text, for a file or a pipe."""
     stream = io.StringIO()
     Console(file=stream, width=width, color_system=None).print(rich_table(table))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
 
 
-def markdown(table: Table) -> str:
+def markdown(table: ResultTable) -> str:
     def text(cell: Cell) -> str:
         lines = "<br>".join(line.replace("|", "\\|") for line in cell.lines)
         return lines + (f" <sup>{_marks(cell)}</sup>" if cell.marks else "")
@@ -60,7 +60,7 @@ def markdown(table: Table) -> str:
     return "\n".join(rows).rstrip() + "\n"
 
 
-def comma_separated(table: Table) -> str:
+def comma_separated(table: ResultTable) -> str:
     """The full numbers: a row per cell, not per row of the table."""
     columns = dict.fromkeys(name for record in table.records for name in record)
     stream = io.StringIO()
@@ -71,7 +71,7 @@ def comma_separated(table: Table) -> str:
     return stream.getvalue()
 
 
-def latex(table: Table) -> str:
+def latex(table: ResultTable) -> str:
     """A `table` with a `tabular`; needs no package."""
 
     def text(cell: Cell) -> str:
@@ -101,7 +101,7 @@ def latex(table: Table) -> str:
     return "\n".join([*rows, r"\end{table}"]) + "\n"
 
 
-FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {
+FORMATS: dict[str, tuple[str, Callable[[ResultTable], str]]] = {
     "terminal": ("txt", terminal),
     "markdown": ("md", markdown),
     "csv": ("csv", comma_separated),

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 from matplotlib.figure import Figure
 
 from experiments.evidence import figures
-from experiments.evidence.cells import NOTHING, Cell, Table
+from experiments.evidence.cells import NOTHING, Cell, ResultTable
 from experiments.evidence.markup import document, element, inline_svg
 from experiments.evidence.pooling import Collected
 from experiments.evidence.run_details import Command, Details
@@ -26,7 +26,7 @@ class Content(NamedTuple):
     """All that a page is made of."""
 
     runs: Collected
-    tables: Sequence[Table]
+    tables: Sequence[ResultTable]
     figures: Mapping[str, Figure | None]  # None: there was nothing to draw
     details: Sequence[Details]
     made_at: datetime
@@ -90,7 +90,7 @@ def _summary(content: Content) -> list[str | Element]:
     return [f"{text} ", element("strong", "Not everything is complete", class_="incomplete"), ": ", link, "."]
 
 
-def _table(table: Table) -> Element:
+def _table(table: ResultTable) -> Element:
     """A table with its caption and footnotes."""
     name = f"table-{table.name}"
     body = []

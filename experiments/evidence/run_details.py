@@ -10,8 +10,9 @@ import numpy as np
 
 from experiments.commandline.arguments import UsageError
 from experiments.evidence.cells import NOTHING, number
-from experiments.evidence.finished_runs import Curves
-from experiments.evidence.pooling import Collected, setting_text
+from experiments.evidence.finished_runs import MemberCurves
+from experiments.evidence.groups import OWN_PHYSICS, setting_text
+from experiments.evidence.pooling import Collected
 from experiments.running import files, run_config
 from sqt_jax.algorithms import make_config
 
@@ -61,14 +62,14 @@ class Details(NamedTuple):
 
 def read_all(collected: Collected) -> list[Details]:
     """Of all runs that something is known of, in the order of the tables. Raises as `read`."""
-    curves: dict[Path, list[Curves]] = {}
+    curves: dict[Path, list[MemberCurves]] = {}
     for group in collected.groups:
         for member in group.members:
             curves.setdefault(member.run, []).append(member)
     return [read(path, members) for path, members in curves.items()]
 
 
-def read(path: Path, curves: Sequence[Curves]) -> Details:
+def read(path: Path, curves: Sequence[MemberCurves]) -> Details:
     """The run in the folder `path`, whose members' tables are `curves`.
 
     Raises:
@@ -137,7 +138,9 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
 
 def _changed(run: run_config.Described) -> list[Setting]:
     config = run.members[0].config
-    own, default = run_config.settings_of(run.members, run.swept), make_config(config.algo, config.env).flat()
+    physics = {"physics": OWN_PHYSICS} if config.physics == OWN_PHYSICS else {}  # else the task's default
+    own = run_config.settings_of(run.members, run.swept)
+    default = make_config(config.algo, config.env, **physics).flat()
     return [
         Setting(name, setting_text(own[name]), setting_text(value))
         for name, value in default.items()
@@ -173,7 +176,7 @@ def _command(entry: Mapping[str, Any], label: str) -> Command:
     return Command(shlex.join(["python", "-m", "experiments.run", *words[1:]]), label, note)
 
 
-def _reached(member: Curves, swept: Sequence[str]) -> Reached:
+def _reached(member: MemberCurves, swept: Sequence[str]) -> Reached:
     returns, env_steps = member.columns["return_mean"], member.columns["env_steps"]
     best = int(np.nanargmax(returns)) if np.isfinite(returns).any() else None
     final = float(returns[-1])
