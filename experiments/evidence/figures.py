@@ -180,6 +180,13 @@ def image(figure: Figure, kind: str) -> bytes:
     return stream.getvalue()
 
 
+def file_contents(draw: Mapping[str, Callable[[], Figure | None]], kind: str) -> tuple[dict[str, bytes], list[str]]:
+    """The figures of `all_figures` as images by file name, and the names of those with nothing to draw."""
+    drawn = {name: function() for name, function in draw.items()}
+    contents = {f"{name}.{kind}": image(figure, kind) for name, figure in drawn.items() if figure}
+    return contents, [name for name, figure in drawn.items() if figure is None]
+
+
 def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
     """Draws with texts as they are: a dollar sign in a run's files starts no formula."""
     with matplotlib.rc_context({"text.parse_math": False}):
