@@ -37,7 +37,7 @@ def test_incomplete_cells_are_marked_and_missing_ones_not_filled(tmp_path):
         "seed 1 diverged after step 50: no evaluation after that counts",
         "seed 0 stopped at step 50 of 100",
         "fewer seeds than other cells, which have 3",
-        "no such run",
+        "not run",
     ]
     assert [record["env"] for record in table.records] == ["cheetah", "ant", "cheetah"]
 

@@ -136,7 +136,7 @@ def _compared(
     cells, records, strata, all_marks = [Cell((label,))], [], [], set()
     for task in tasks:
         if task not in pairs:
-            cells.append(Cell((NOTHING,), notes("no such run")))
+            cells.append(Cell((NOTHING,), notes("not run")))
             continue
         group, other, note = pairs[task]
         why = [note] if note else []

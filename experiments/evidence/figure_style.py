@@ -1,4 +1,4 @@
-"""What all figures share: colours, line styles and markers, panels, legends and footnotes."""
+"""Shared by all figures: colours, line styles and markers, panels, legends and footnotes."""
 
 import textwrap
 from collections.abc import Mapping, Sequence

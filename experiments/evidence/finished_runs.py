@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.commandline.arguments import UsageError, printable
+from experiments.evidence import run_settings
 
 REQUIRED = ("member", "env_steps", "gradient_steps", "seed", "return_mean", "q_std")
 
@@ -74,13 +75,9 @@ def read_run(path: Path) -> list[MemberCurves]:
     Raises:
       UsageError: config.json or evaluations.csv cannot be read or is damaged.
     """
-    from experiments.running import run_config  # brings JAX
-
+    run = run_settings.read(path)
     try:
-        run = run_config.read(path)
         columns = _read_table(path / "evaluations.csv")
-    except run_config.NotDescribed as error:
-        raise UsageError(f"{path}: {error}") from None
     except OSError as error:
         raise UsageError(f"{path}: its evaluations.csv cannot be read ({error.strerror})") from None
     except ValueError as error:
@@ -88,18 +85,18 @@ def read_run(path: Path) -> list[MemberCurves]:
     evaluated_on = run.content.get("evaluated_on")
     versions = {printable(name): printable(str(value)) for name, value in run.content["versions"].items()}
     found = []
-    for index, member in enumerate(run.members):
+    for index, (seed, settings) in enumerate(run.members):
         kept = columns["member"] == index
         if not kept.any():
             continue
         own = {name: column[kept] for name, column in columns.items()}
         order = np.argsort(own["env_steps"], kind="stable")
         own = {name: column[order] for name, column in own.items()}
-        if (np.diff(own["env_steps"]) == 0).any() or not (own["seed"] == member.seed).all():
+        if (np.diff(own["env_steps"]) == 0).any() or not (own["seed"] == seed).all():
             raise UsageError(
                 f"{path}: its evaluations.csv is damaged: member {index} has rows twice or of another seed"
             )
-        settings, rows = member.config.flat(), run.content["replay_rows"]
+        rows = run.content["replay_rows"]
         # A replay that never overwrites trains the same, whatever its capacity. A resumed run keeps its first capacity.
         settings["replay_capacity"] = rows if rows < settings["steps"] else "all"
         if evaluated_on is not None:
@@ -108,7 +105,7 @@ def read_run(path: Path) -> list[MemberCurves]:
         diverged = np.isnan(own["return_mean"])
         critics = [name for name in ("q_mean", "q_std", "value_bias") if name in own]
         own |= {name: np.where(diverged, np.nan, own[name]) for name in critics}
-        found.append(MemberCurves(run=path, seed=member.seed, settings=settings, versions=versions, columns=own))
+        found.append(MemberCurves(run=path, seed=seed, settings=settings, versions=versions, columns=own))
     if not set(columns["member"]) <= set(range(len(run.members))):
         raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that config.json does not have")
     return found

@@ -167,7 +167,7 @@ def _algorithms(
             for task in collected.tasks:
                 group = row.groups.get(task)
                 if group is None:
-                    cells.append(Cell((NOTHING,), notes("no such run")))
+                    cells.append(Cell((NOTHING,), notes("not run")))
                     continue
                 text, numbers, why = cell_of(group)
                 why = [*group.notes, *why]

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.commandline.arguments import UsageError
+from experiments.evidence import run_settings
 from experiments.evidence.cells import NOTHING, number
 from experiments.evidence.finished_runs import MemberCurves
 from experiments.evidence.groups import OWN_PHYSICS, setting_text
 from experiments.evidence.pooling import Collected
-from experiments.running import files, run_config
-from sqt_jax.algorithms import make_config
+from experiments.evidence.run_settings import RunSettings
+from experiments.running import files
+from sqt_jax.algorithms import ALGORITHMS, make_config
 
 MAX_SUMMARY_BYTES = 10_000_000
 STATUSES = ("done", "interrupted", "diverged")
@@ -81,19 +82,16 @@ def read(path: Path, curves: Sequence[MemberCurves]) -> Details:
     Raises:
       UsageError: config.json cannot be read or is damaged.
     """
-    try:
-        run = run_config.read(path)
-    except run_config.NotDescribed as error:
-        raise UsageError(f"{path}: {error}") from None
-    config, content = run.members[0].config, run.content
+    run = run_settings.read(path)
+    settings, content = run.members[0][1], run.content
     status, end = _end(path, bool(content["resumed"]))
     return Details(
         path=path,
-        algo=config.algo,
-        env=config.env,
-        seeds=tuple(dict.fromkeys(member.seed for member in run.members)),
-        steps=config.train.steps,
-        physics=config.physics,
+        algo=settings["algo"],
+        env=settings["env"],
+        seeds=tuple(dict.fromkeys(seed for seed, _ in run.members)),
+        steps=settings["steps"],
+        physics=settings["physics"],
         status=status,
         facts=_facts(content) | end,
         settings=_changed(run),
@@ -142,11 +140,14 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _changed(run: run_config.Described) -> list[Setting]:
-    config = run.members[0].config
-    physics = {"physics": OWN_PHYSICS} if config.physics == OWN_PHYSICS else {}  # else the task's default
-    own = run_config.settings_of(run.members, run.swept)
-    default = make_config(config.algo, config.env, **physics).flat()
+def _changed(run: RunSettings) -> list[Setting]:
+    """The settings that differ from the algorithm's defaults; none for an unknown algorithm."""
+    settings = run.members[0][1]
+    if settings["algo"] not in ALGORITHMS:
+        return []
+    own = settings | {name: tuple(dict.fromkeys(member[name] for _, member in run.members)) for name in run.swept}
+    physics = {"physics": OWN_PHYSICS} if settings["physics"] == OWN_PHYSICS else {}  # else the task's default
+    default = make_config(settings["algo"], settings["env"], **physics).flat()
     return [
         Setting(name, setting_text(own[name]), setting_text(value))
         for name, value in default.items()

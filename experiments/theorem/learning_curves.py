@@ -1,4 +1,4 @@
-"""What an algorithm learned on an MDP: measurements over the steps, and their statistics over seeds."""
+"""Learning curves of an algorithm on an MDP: measurements over the steps, and their statistics over seeds."""
 
 import math
 from collections.abc import Iterator, Mapping

@@ -145,7 +145,7 @@ def model_of(mdp: Mdp, optimal: np.ndarray) -> Model:
 
     def cumulative(probabilities: np.ndarray) -> np.ndarray:
         total = np.cumsum(probabilities, axis=-1)
-        return np.where(total > 1 - 1e-12, 1.0, total)  # a row that sums to 1 but for rounding never ends an episode
+        return np.where(total > 1 - 1e-12, 1.0, total)  # a row that sums to 1 up to rounding never ends an episode
 
     arrays = (mdp.transition, cumulative(mdp.transition), mdp.reward, mdp.noise, cumulative(mdp.start), optimal)
     return Model(*(jnp.asarray(array, jnp.float32) for array in arrays))
