@@ -12,6 +12,6 @@ def test_the_committed_table_has_todays_legend():
 
 
 def test_rows_that_are_all_alike_are_one():
-    found = summary.cells({("grid", "sqt_shared"): curves((0.0, 0.5), 2), ("grid", "q_learning"): curves()})
+    found = summary.learning_rows({("grid", "sqt_shared"): curves((0.0, 0.5), 2), ("grid", "q_learning"): curves()})
     assert [row[:3] for row in found] == [("grid", "sqt_shared", "all alike"), ("grid", "q_learning", "-")]
     assert all(len(row) == len(summary.HEADER) for row in found)

@@ -31,7 +31,7 @@ class Comparison(NamedTuple):
 
     group: Group
     other: Group | None  # None: there is none
-    note: str = ""  # then why
+    note: str = ""  # why, where `other` is None
 
 
 def against_baseline(collected: Collected, reference: bool, name: str) -> ResultTable:

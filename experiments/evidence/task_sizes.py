@@ -49,7 +49,9 @@ def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> ResultTable:
         lines.append(Line([Cell((cell,)) for cell in cells]))
         records.append(record)
     header += [f"{published.PAPER}: observation / action"] if reference else []
-    caption = "Read from the environments; those of an environment from Python, from its runs' policies."
+    caption = "Read from the environments."
+    if any(row["episode_steps"] is None for row in sizes):
+        caption += " Without the steps of an episode: read from a run's policy."
     return ResultTable("table1", "Table 1: sizes of the tasks", header, [lines], caption, [], records)
 
 

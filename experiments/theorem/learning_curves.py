@@ -22,7 +22,10 @@ class LearningCurves(NamedTuple):
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
-    """The mean of `values` [seeds] and the half width of its 95 % t interval; NaN for one seed."""
+    """The mean of `values` [seeds] and the half width of its 95 % t interval.
+
+    The width comes from the std with ddof 1 and is NaN for one seed.
+    """
     if len(values) < 2:
         return float(np.mean(values)), math.nan
     width = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))

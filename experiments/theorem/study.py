@@ -64,7 +64,7 @@ def run(settings: Settings, out: Path, command: str) -> None:
     sqt = settings.algorithms()["sqt"]
     expansions = contraction.expansions(sqt, settings.coefs, settings.ddof, contraction.PAIRS)
     found = statements(settings, results, expansions)
-    table, ratios = summary.cells(results), summary.expansion_table(expansions)
+    table, ratios = summary.learning_rows(results), summary.expansion_table(expansions)
     console.print(summary.terminal_table([summary.HEADER, *table], left=2))
     console.print(" ".join(summary.LEGEND), highlight=False)
     console.print(summary.terminal_table(ratios, left=0))

@@ -35,7 +35,7 @@ HEADER = (
 )
 
 
-def cells(results: Mapping[Names, LearningCurves]) -> list[tuple[str, ...]]:
+def learning_rows(results: Mapping[Names, LearningCurves]) -> list[tuple[str, ...]]:
     """A row of texts below `HEADER` per MDP, algorithm and coefficient."""
     found: list[tuple[str, ...]] = []
     for (mdp, algo), k, curves in rows(results):
