@@ -1,4 +1,4 @@
-"""What is to be seen in a figure."""
+"""Reads a drawn figure."""
 
 import numpy as np
 from matplotlib.colors import to_rgb

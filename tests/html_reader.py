@@ -1,10 +1,10 @@
-"""What is on a page, read as a browser reads it, without one."""
+"""Reads a page as a browser does, without one."""
 
 from html.parser import HTMLParser
 
 
 class Reader(HTMLParser):
-    """Tags and texts of a page, as a browser expects them."""
+    """Tags and texts of a page, as a browser sees them."""
 
     def __init__(self, text):
         super().__init__()

@@ -2,19 +2,22 @@
 
 import numpy as np
 
-from experiments.theorem.claims import Curves
-from experiments.theorem.q_learning import Record
+from experiments.theorem.learning_curves import LearningCurves
+from experiments.theorem.q_learning import Measurements
 
 STEPS = np.array([100, 1000, 10_000])
 
 
 def curves(coefs=(None,), tables=1, bias=0.1, error=(3.0, 2.0, 1.0), std=0.0, ratio=0.5, seeds=4):
-    """A number or one per checkpoint for each quantity; seeds differ by a little."""
+    """A number or one per measurement for each quantity; seeds differ by a little."""
     spread = 1 + 0.01 * np.arange(seeds)[:, None, None]
     shape = (seeds, len(coefs), len(STEPS))
 
     def filled(value):
         return np.broadcast_to(np.asarray(value, float), shape) * spread
 
-    record = Record(filled(error), filled(error), filled(bias), filled(std), filled(ratio))
-    return Curves(tuple(coefs), STEPS, record, np.ones((seeds, len(coefs), tables, 2, 2)))
+    record = Measurements(
+        error_max=filled(error), error_mean=filled(error), bias=filled(bias), std=filled(std), ratio=filled(ratio)
+    )
+    values = np.ones((seeds, len(coefs), tables, 2, 2))
+    return LearningCurves(coefs=tuple(coefs), steps=STEPS, record=record, tables=values)

@@ -3,11 +3,13 @@
 import csv
 import json
 import math
+from pathlib import Path
 from unittest import mock
 
 import jax
 import numpy as np
 
+from experiments.evidence.finished_runs import MemberCurves
 from experiments.running import run_config
 from experiments.running.records import EVALUATION_COLUMNS
 from sqt_jax.algorithms import agent_of, make_config
@@ -72,6 +74,16 @@ def write_run(
                 row |= {name: values[index][evaluation] for name, values in (more or {}).items()}
                 writer.writerow({name: "" if value != value else value for name, value in row.items()})
     return path
+
+
+def made_member(algo="td3", env="cheetah", returns=(0, 1, 2), seed=0, run="run", **settings):
+    """A member as `read_run` gives it, without files: for algorithms and environments that have no name here."""
+    steps = np.arange(len(returns)) * 50.0
+    columns = {"env_steps": steps, "gradient_steps": np.maximum(steps - 10, 0), "return_mean": np.array(returns, float)}
+    columns["q_std"] = np.full(len(returns), 0.5)
+    config = {"steps": STEPS, "warmup_steps": 10, "batch_size": 8, "eval_every": 50, "eval_episodes": 1}
+    config = make_config("td3", "cheetah", **config).flat() | {"replay_capacity": "all", "eval_physics": "mujoco"}
+    return MemberCurves(Path(run), seed, config | {"algo": algo, "env": env} | settings, {"jax": "0.10.2"}, columns)
 
 
 def make_hostile(path):

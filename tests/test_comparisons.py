@@ -3,7 +3,7 @@ from made_runs import write_run
 from table_reader import cells
 
 from experiments.evidence.cells import NOT_RESAMPLED
-from experiments.evidence.comparisons import versus_base
+from experiments.evidence.comparisons import against_baseline
 from experiments.evidence.pooling import collect
 
 
@@ -12,7 +12,7 @@ def test_improvement_by_hand(tmp_path):
     write_run(tmp_path, "td3_sqt", "cheetah", curves=[[0, 0, 18], [0, 0, 18]])
     write_run(tmp_path, "td3", "ant", curves=[[0, 0, 4], [0, 0, 4]])
     write_run(tmp_path, "td3_sqt", "ant", curves=[[0, 0, 3], [0, 0, 5]])
-    table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
+    table = against_baseline(collect([str(tmp_path)]), False, "table2_improvement")
     ((label, cheetah, ant, over, chance),) = cells(table)
     assert label == "td3_sqt against td3"
     # 18 against a mean of 15, drawn from 10 to 20; it exceeds one of two.
@@ -23,11 +23,11 @@ def test_improvement_by_hand(tmp_path):
     assert table.records[-1]["improvement_percent"] == pytest.approx(10)
 
 
-def test_improvement_over_a_base_that_lost_or_is_not_there(tmp_path):
+def test_improvement_over_a_baseline_that_lost_or_was_not_run(tmp_path):
     write_run(tmp_path, "td3", curves=[[-5, -2, -4]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 1, 2]])
     write_run(tmp_path, "sac_sqt")
-    table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
+    table = against_baseline(collect([str(tmp_path)]), False, "table2_improvement")
     assert cells(table) == [["td3_sqt against td3", "-|P 1.00 [1]"], ["sac_sqt against sac", "- [2]"]]
     assert table.notes == [
         "no percentage: the other mean is not positive",
@@ -38,7 +38,7 @@ def test_improvement_over_a_base_that_lost_or_is_not_there(tmp_path):
 def test_a_percentage_without_an_interval_says_why(tmp_path):
     write_run(tmp_path, "td3", curves=[[-9, -9, 5], [-9, -9, -1]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 1, 3], [0, 1, 3]])
-    table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
+    table = against_baseline(collect([str(tmp_path)]), False, "table2_improvement")
     assert cells(table) == [["td3_sqt against td3", "+50.0 %|P 0.50 [0.00, 1.00] [1]"]]
     assert table.notes == ["no interval of the percentage: the other mean is not positive in some resamples"]
 
@@ -46,14 +46,14 @@ def test_a_percentage_without_an_interval_says_why(tmp_path):
 def test_a_side_with_one_seed_has_no_interval(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 0, 10]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 0, 12], [0, 0, 18]])
-    table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
+    table = against_baseline(collect([str(tmp_path)]), False, "table2_improvement")
     assert cells(table) == [["td3_sqt against td3", "+50.0 %|P 1.00"]]
 
 
 def test_a_comparison_says_which_of_the_two_is_incomplete(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 1]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 2, 3]])
-    table = versus_base(collect([str(tmp_path)]), False, "table2_improvement")
+    table = against_baseline(collect([str(tmp_path)]), False, "table2_improvement")
     assert table.notes == ["td3 on cheetah: seed 0 stopped at step 50 of 100"]
 
 
@@ -61,15 +61,15 @@ def test_intervals_of_scores_and_no_others_are_said_to_leave_the_choice_out(tmp_
     for algo in ("td3", "td3_sqt"):
         write_run(tmp_path, algo)
     runs = collect([str(tmp_path)])
-    assert NOT_RESAMPLED in versus_base(runs, False, "table2_improvement").caption
-    assert NOT_RESAMPLED not in versus_base(runs, False, "table3_change").caption
+    assert NOT_RESAMPLED in against_baseline(runs, False, "table2_improvement").caption
+    assert NOT_RESAMPLED not in against_baseline(runs, False, "table3_change").caption
 
 
 def test_the_papers_mean_improvements_are_shown_where_the_algorithm_is(tmp_path):
     for algo in ("td3", "td3_sqt", "sac"):
         write_run(tmp_path, algo)
     runs = collect([str(tmp_path)])
-    rows = cells(versus_base(runs, True, "table2_improvement"))
+    rows = cells(against_baseline(runs, True, "table2_improvement"))
     assert [row[-2] for row in rows if "published" in row[0]] == ["+21.6 %"]
-    rows = cells(versus_base(runs, True, "table3_change"))
+    rows = cells(against_baseline(runs, True, "table3_change"))
     assert [row[-2] for row in rows if "published" in row[0]] == ["+35.4 %"]

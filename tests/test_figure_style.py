@@ -3,8 +3,9 @@ from figure_reader import legend_of, panels
 from made_runs import write_run
 from matplotlib.colors import to_rgb
 
-from experiments.evidence.figure_style import ALGORITHM_COLOURS, FORM_LINES, Stars, finish, make_panels, styles
+from experiments.evidence.figure_style import ALGORITHM_COLOURS, PENALTY_LINES, Stars, add_texts, make_panels, styles
 from experiments.evidence.pooling import collect
+from experiments.evidence.variants import baseline_of, variants_of
 from sqt_jax.algorithms import ALGORITHMS
 
 
@@ -15,15 +16,15 @@ def luminance(colour):
 def finished(runs):
     """A figure with nothing in its panels."""
     figure, found = make_panels(runs.rows, runs.tasks)
-    finish(figure, found, styles(runs.rows), Stars(), "heading", "below", "beside")
+    add_texts(figure, found, styles(runs.rows), Stars(), "heading", "below", "beside")
     return figure
 
 
 def test_every_algorithm_has_a_colour_and_a_line_of_its_own():
     assert {*ALGORITHM_COLOURS} == {*ALGORITHMS}
     assert len({*ALGORITHM_COLOURS.values()}) == len(ALGORITHM_COLOURS)
-    for base in ("td3", "sac", "td7"):  # in grey, a form is lighter than its base
-        shades = [luminance(ALGORITHM_COLOURS[base + form]) for form in FORM_LINES]
+    for baseline in ("td3", "sac", "td7"):  # in grey, an SQT variant is lighter than its baseline
+        shades = [luminance(ALGORITHM_COLOURS[algo]) for algo in (baseline, *variants_of(baseline))]
         assert shades == sorted(shades) and np.diff(shades).min() > 0.08
 
 
@@ -33,7 +34,7 @@ def test_a_row_has_the_same_style_whatever_stands_beside_it(tmp_path):
     both, one = collect([str(tmp_path)]), collect([str(tmp_path / "a")])
     style = styles(both.rows)["sac_sqt"]
     assert styles(one.rows)["sac_sqt"] == style
-    assert style == (ALGORITHM_COLOURS["sac_sqt"], FORM_LINES["_sqt"], "")
+    assert style == (ALGORITHM_COLOURS["sac_sqt"], PENALTY_LINES["batch_std"], "")
 
 
 def test_coefficients_of_an_algorithm_are_shades_with_markers(tmp_path):
@@ -43,19 +44,15 @@ def test_coefficients_of_an_algorithm_are_shades_with_markers(tmp_path):
     assert shades == sorted(shades, reverse=True) and len({style.marker for style in found}) == 3
 
 
-def test_few_algorithms_share_a_panel_per_task_and_many_have_one_per_family(tmp_path):
+def test_few_algorithms_share_a_panel_per_task_and_many_have_one_per_baseline(tmp_path):
     algos = [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))]
     for algo in algos:
         for env in ("cheetah", "ant"):
-            write_run(tmp_path / base(algo), algo, env)
+            write_run(tmp_path / baseline_of(algo), algo, env)
     many = finished(collect([str(tmp_path)]))
     assert len(panels(many)) == 6 and sorted(legend_of(many)) == sorted(algos)
     few = finished(collect([str(tmp_path / "td3"), str(tmp_path / "sac")]))
     assert [axes.get_title() for axes in panels(few)] == ["cheetah", "ant"] and len(legend_of(few)) == 6
-
-
-def base(algo):
-    return algo.partition("_")[0]
 
 
 def test_many_tasks_go_on_in_the_next_row(tmp_path):

@@ -7,7 +7,8 @@ from matplotlib.image import imread
 from experiments.evidence import figures
 from experiments.evidence.cells import NOT_RESAMPLED
 from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS
-from experiments.evidence.figures import draw_curves, over_time, penalty_sweep
+from experiments.evidence.figures import draw_curves, over_time
+from experiments.evidence.penalty_figure import penalty_sweep
 from experiments.evidence.pooling import collect
 from experiments.running.records import EVALUATION_COLUMNS
 
@@ -88,7 +89,7 @@ def test_what_was_not_measured_has_no_figure(tmp_path):
     assert penalty_sweep(runs, "iqm") is None
 
 
-def test_a_sweep_has_a_dot_per_seed_and_the_base_at_nothing(tmp_path):
+def test_a_sweep_has_a_dot_per_seed_and_its_baseline_at_0(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 0, 5], [0, 0, 7]])
     curves = [[0, 0, value] for value in (1, 3, 2, 4)]
     write_run(tmp_path, "td3_sqt", curves=curves, swept={"penalty_coef": (0.25, 0.5)})
@@ -102,7 +103,7 @@ def test_a_sweep_has_a_dot_per_seed_and_the_base_at_nothing(tmp_path):
     assert legend_of(figure) == ["td3", "td3_sqt"]
 
 
-def test_sweeps_of_one_base_draw_it_once(tmp_path):
+def test_sweeps_of_one_baseline_draw_it_once(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 0, 5]])
     for algo in ("td3_sqt", "td3_sqt_tuple"):
         write_run(tmp_path, algo, curves=[[0, 0, 1], [0, 0, 2]], swept={"penalty_coef": (0.25, 0.5)})
@@ -159,7 +160,7 @@ def test_images(tmp_path, kind, start):
 def test_every_figure_is_drawn_and_takes_no_text_for_a_formula(tmp_path):
     write_run(tmp_path / "a", "td3", curves=[[0, 1, 2]], seeds=[0])
     write_run(tmp_path / "b", "td3", curves=[[0, 1, 3]], seeds=[1], versions={"jax": r"$\frac{"})
-    draw = figures.every(collect([str(tmp_path)]), "iqm")
+    draw = figures.all_figures(collect([str(tmp_path)]), "iqm")
     drawn = {name: function() for name, function in draw.items()}
     assert {name for name, figure in drawn.items() if figure} == {"learning_curves", "q_std", "performance_profile"}
     assert drawn["penalty_sweep"] is None and drawn["value_bias"] is None

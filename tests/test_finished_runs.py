@@ -17,23 +17,23 @@ def test_runs_are_found_in_and_below_folders_each_once(tmp_path):
     assert find([str(two), str(tmp_path), f"{one}/"]) == ([two, one], [])
 
 
-def test_folders_with_evaluations_alone_are_named(tmp_path):
+def test_folders_with_evaluations_only_are_named(tmp_path):
     one, two = write_run(tmp_path / "a"), write_run(tmp_path / "b", "sac")
     (two / "config.json").unlink()
-    assert find([str(tmp_path)]) == ([one], [f"left out: {two} has an evaluations.csv, but no config.json"])
+    assert find([str(tmp_path)]) == ([one], [f"left out: {two} has an evaluations.csv but no config.json"])
 
 
 def test_folders_in_which_there_is_no_run_are_named(tmp_path):
     path = write_run(tmp_path / "a")
     for text, message in [
-        (str(tmp_path / "none"), "there is no such folder; RUNS expects folders of runs or folders above them"),
-        (str(path / "config.json"), "is no folder"),
+        (str(tmp_path / "none"), "does not exist; RUNS expects folders of runs or folders above them"),
+        (str(path / "config.json"), "is not a folder"),
     ]:
         with pytest.raises(UsageError) as error:
             find([text])
         assert message in str(error.value) and "\n" not in str(error.value)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match="holds no run"):
+    with pytest.raises(UsageError, match="contains no run"):
         find([str(tmp_path / "empty")])
 
 
@@ -51,12 +51,15 @@ def test_a_line_that_was_cut_off_is_no_row(tmp_path):
     [
         (lambda text: "", "it is empty"),
         (lambda text: text.replace("q_std", "std"), "it has no column q_std"),
-        (lambda text: text.replace("value_bias", "value_bias/../x"), "'value_bias/../x' is no name of a column"),
+        (lambda text: text.replace("value_bias", "value_bias/../x"), "'value_bias/../x' is not a column's name"),
         (lambda text: text.replace("2.0", "two"), "could not convert string to float: 'two'"),
         (lambda text: text.replace(",0.5,", ","), "line 3 has 11 fields instead of 12"),
-        (lambda text: text + text.splitlines()[-1] + "\n", "member 0 has other rows than it should"),
-        (lambda text: text.replace("0,100,90,0", "0,100,90,1"), "member 0 has other rows than it should"),
-        (lambda text: text.replace("0,100,90,0", "1,100,90,0"), "it has members that its config.json has not"),
+        (lambda text: text + text.splitlines()[-1] + "\n", "member 0 has rows twice or of another seed"),
+        (
+            lambda text: text.replace("0,100,90,0", "0,100,90,1"),
+            "member 0 has rows twice or of another seed",
+        ),
+        (lambda text: text.replace("0,100,90,0", "1,100,90,0"), "it has members that config.json does not have"),
         (lambda text: text.replace("0,100,90,0", "0,,90,0"), "a field of env_steps is empty"),
     ],
 )
@@ -72,7 +75,7 @@ def test_damaged_evaluations_are_named(tmp_path, damage, message):
 
 
 @pytest.mark.parametrize("value", ["<script>", "warp drive", 3, ["mjx"], ""])
-def test_a_physics_that_cannot_have_evaluated_is_refused(tmp_path, value):
+def test_a_physics_that_cannot_have_evaluated_is_rejected(tmp_path, value):
     path = write_run(tmp_path)
     content = json.loads((path / "config.json").read_text()) | {"evaluated_on": value}
     (path / "config.json").write_text(json.dumps(content))

@@ -5,10 +5,10 @@ import re
 import pytest
 from rich.console import Console
 
-from experiments.evidence.cells import Cell, Line, Table
+from experiments.evidence.cells import Cell, Line, ResultTable
 from experiments.evidence.formats import FORMATS, comma_separated, latex, markdown, rich_table, terminal
 
-TABLE = Table(
+TABLE = ResultTable(
     "table2",
     "Table 2: scores",
     ["algorithm", "cheetah & co", "UTD"],

@@ -75,6 +75,6 @@ def test_centred_values_are_0_on_average_where_nothing_ends():
     assert mdps.centred(chain, 0.8) is chain
 
 
-def test_a_discount_of_one_is_refused():
+def test_a_discount_of_one_is_rejected():
     with pytest.raises(ValueError, match="gamma"):
         mdps.optimal_q(two_states(), 1.0)

@@ -4,23 +4,17 @@ import pytest
 from html_reader import Reader
 from made_runs import write_run
 
-from experiments.evidence import figures, paper_tables, run_details
+from experiments.evidence import paper_tables
 from experiments.evidence.cells import Cell
-from experiments.evidence.page import Content, page, sort_key
+from experiments.evidence.page import make_content, page, sort_key
 from experiments.evidence.pooling import collect
 
 
 def content_of(folder, reference=False):
     runs = collect([str(folder)])
-    return Content(
-        runs,
-        paper_tables.make_tables(runs, reference),
-        {name: draw() for name, draw in figures.every(runs, "iqm").items()},
-        run_details.read_all(runs),
-        datetime(2026, 1, 2, 3, 4, tzinfo=UTC),
-        "sqt_jax 1.2.3",
-        "python -m experiments.report runs",
-    )
+    content = make_content(runs, reference, "iqm", "python -m experiments.report runs")
+    when = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
+    return content._replace(tables=paper_tables.make_tables(runs, reference), made_at=when, made_by="sqt_jax 1.2.3")
 
 
 @pytest.mark.parametrize(
@@ -58,13 +52,13 @@ def test_everything_is_there_in_its_order(tmp_path):
         "2 runs of 2 algorithms (td3, td3_sqt) on 1 task (cheetah): 3 members with the seeds 0, 1.",
         "Planned: 100 environment steps per member; trained, over all members: 300.",
         "How the runs ended: 2 not ended.",
-        "Not everything is complete",
+        "Some runs are incomplete",
         "Table 2: maximum average return",
-        "Table 2, SQT against its base",
+        "Table 2, SQT variants against their baselines",
         "Table 3",
         "Seeds",
         "Figure 1: Return of an evaluation episode",
-        "There was nothing to draw for value_bias, penalty_sweep.",
+        "Nothing to draw for value_bias, penalty_sweep.",
         "Run 1: td3 on cheetah",
         "Run 2: td3_sqt on cheetah",
         "td3_sqt on cheetah: fewer seeds than other cells, which have 2",
@@ -91,7 +85,7 @@ def test_footnotes_are_linked_and_no_id_is_there_twice(tmp_path):
 def test_a_complete_report_says_so(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 5, 10], [0, 6, 11]])
     text = page(content_of(tmp_path))
-    assert "Every score is of all that was planned." in text and "Not everything" not in text
+    assert "Every score covers all planned steps and seeds." in text and "Some runs" not in text
 
 
 def test_many_names_are_counted_in_the_title(tmp_path):

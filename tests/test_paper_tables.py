@@ -2,26 +2,10 @@ from made_runs import write_run
 from table_reader import cells
 
 from experiments.evidence import paper_tables, published
-from experiments.evidence.paper_tables import make_tables, table_1, table_2, table_3, table_4
+from experiments.evidence.paper_tables import make_tables, table_2, table_3, table_4
 from experiments.evidence.pooling import collect
 
 NAN = float("nan")
-
-
-def test_table_1_by_hand():
-    sizes = [{"env": "ant", "task": "Ant-v4", "observation": 27, "action": 8, "episode_steps": 1000}]
-    assert cells(table_1(sizes, reference=False)) == [["ant", "Ant-v4", "27", "8", "1,000"]]
-    table = table_1(sizes, reference=True)
-    assert cells(table) == [["ant", "Ant-v4", "27", "8", "1,000", "27 / 8"]]
-    assert table.records == [sizes[0] | {"paper_observation": 27, "paper_action": 8}]
-
-
-def test_the_sizes_are_the_environments(tmp_path):
-    write_run(tmp_path, env="hopper")
-    runs = collect([str(tmp_path)])
-    sizes = {row["env"]: (row["observation"], row["action"]) for row in paper_tables.task_sizes(runs)}
-    theirs = {env: tuple(size) for env, size in published.paper()["table1_obs_action"].items()}
-    assert sizes == theirs | {"hopper": (11, 3)}
 
 
 def test_table_2_by_hand(tmp_path):
@@ -53,7 +37,7 @@ def test_incomplete_cells_are_marked_and_missing_ones_not_filled(tmp_path):
         "seed 1 diverged after step 50: no evaluation after that counts",
         "seed 0 stopped at step 50 of 100",
         "fewer seeds than other cells, which have 3",
-        "no such run",
+        "not run",
     ]
     assert [record["env"] for record in table.records] == ["cheetah", "ant", "cheetah"]
 
@@ -62,7 +46,7 @@ def test_a_cell_without_an_evaluation_of_all_seeds(tmp_path):
     write_run(tmp_path, curves=[[NAN, NAN]])
     table = table_2(collect([str(tmp_path)]), reference=False)
     assert cells(table)[0][1].startswith("- [")
-    assert "no evaluation that all its seeds have" in table.notes
+    assert "its seeds have no evaluation in common" in table.notes
 
 
 def test_what_a_rows_tasks_do_not_share_is_said(tmp_path):
@@ -71,7 +55,7 @@ def test_what_a_rows_tasks_do_not_share_is_said(tmp_path):
     table = table_2(collect([str(tmp_path)]), reference=False)
     assert cells(table)[0][0] == "td3_sqt [1]" and cells(table)[0][-3:] == ["0.5 / 0.25", "100 / 200", "1"]
     assert table.notes[0] == "penalty_coef: 0.5 (cheetah), 0.25 (ant)"
-    assert "physics is mjx, but mujoco for td3_sqt on ant." in table.caption
+    assert "Cells differ in physics: it is mjx, but mujoco for td3_sqt on ant." in table.caption
     assert "Common to all: warmup_steps 10, eval_physics mujoco" in table.caption
 
 
@@ -104,7 +88,7 @@ def test_table_4_by_hand(tmp_path):
     ]
 
 
-def test_forms_that_differ_in_more_than_the_penalty_are_not_compared(tmp_path):
+def test_variants_that_differ_in_more_than_the_penalty_are_not_compared(tmp_path):
     write_run(tmp_path, "td3_sqt")
     write_run(tmp_path, "td3_sqt_tuple", tau=0.1)
     table = table_4(collect([str(tmp_path)]), reference=False)
@@ -126,7 +110,7 @@ def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
     rows = [row for row in cells(table)]
     assert table.header[1:3] == ["humanoid", "ant-v5"]
     labels = [row[0] for row in rows]
-    # Those of the base, though we have no run of it; then ours and its own.
+    # Those of the baseline, of which there is no run; then ours and its own.
     assert labels[0].startswith("published: td3, environment v3, 10 seeds|Tianshou")
     ours = labels.index("td3_sqt")
     released = rows[ours + 1]
@@ -143,7 +127,7 @@ def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
 def test_nothing_published_is_said(tmp_path):
     write_run(tmp_path, "redq", "brax:ant")
     table = table_2(collect([str(tmp_path)]), reference=True)
-    assert table.caption.endswith("Nothing published is known for these algorithms and tasks.")
+    assert table.caption.endswith("No published numbers for these algorithms and tasks.")
 
 
 def test_seeds_by_hand(tmp_path):

@@ -44,7 +44,7 @@ def test_what_there_is_nothing_of_is_said(runs, tmp_path, capsys):
         (["runs", "--format=gif"], "--format: expects one of png, svg, pdf, not 'gif'"),
         (["runs", "--statistic=median"], "--statistic: expects one of iqm, mean, not 'median'"),
         (["runs", "--overwite"], "--overwite: unknown flag; did you mean --overwrite?"),
-        (["none"], "none: there is no such folder"),
+        (["none"], "none: does not exist"),
     ],
 )
 def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):

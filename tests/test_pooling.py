@@ -5,7 +5,8 @@ import pytest
 from made_runs import write_run
 
 from experiments.commandline.arguments import UsageError
-from experiments.evidence.pooling import base_algorithm, collect, row_differences
+from experiments.evidence.pooling import collect, row_differences
+from experiments.evidence.variants import baseline_of
 from sqt_jax.algorithms import ALGORITHMS
 
 NAN = float("nan")
@@ -27,11 +28,11 @@ def test_seeds_of_runs_with_equal_settings_are_pooled(tmp_path):
     assert group.notes == ()
 
 
-def test_the_same_seed_twice_is_refused(tmp_path):
+def test_the_same_seed_twice_is_rejected(tmp_path):
     one, two = write_run(tmp_path / "a", seeds=[3]), write_run(tmp_path / "b", seeds=[3])
     with pytest.raises(UsageError) as error:
         collect([str(tmp_path)])
-    message = f"{one} and {two}: both hold seed 3 of td3 on cheetah with the same settings; expects one of them"
+    message = f"{one} and {two}: both have seed 3 of td3 on cheetah with the same settings; expected only one of them"
     assert str(error.value) == message
 
 
@@ -95,7 +96,7 @@ def test_what_is_incomplete_says_why(tmp_path):
     assert group.notes == (
         "seed 1 diverged after step 50: no evaluation after that counts",
         "seed 7 stopped at step 50 of 100",
-        "evaluations up to step 50 count, which all its seeds have",
+        "only evaluations up to step 50 count, because not all seeds have later ones",
         "seeds from runs with different versions: jax 0.10.2, 0.11.0",
     )
     assert (group.score.mean, group.scored_at) == (3.0, 50)  # of all three seeds, and of no step that one has not
@@ -120,7 +121,7 @@ def test_a_run_without_an_evaluation_is_left_out_and_named(tmp_path):
         collect([str(path)])
 
 
-def test_the_base_is_alike_in_everything_but_the_penalty(tmp_path):
+def test_the_baseline_has_equal_settings_except_the_penalty(tmp_path):
     write_run(tmp_path / "a", "td3")
     write_run(tmp_path / "a", "td3_sqt")
     write_run(tmp_path / "b", "sac", updates_per_step=2)
@@ -128,22 +129,23 @@ def test_the_base_is_alike_in_everything_but_the_penalty(tmp_path):
     write_run(tmp_path / "c", "td7_sqt")
     found = collect([str(tmp_path)])
     td3, td3_sqt, _, sac_sqt, td7_sqt = found.groups
-    assert found.base(td3_sqt) == (td3, "")
-    assert found.base(sac_sqt) == (
+    assert found.baseline(td3_sqt) == (td3, "")
+    assert found.baseline(sac_sqt) == (
         None,
         "not compared: sac and sac_sqt on cheetah differ in updates_per_step (2, 1)",
     )
-    assert found.base(td7_sqt) == (None, "no run of td7 on cheetah to compare with")
+    assert found.baseline(td7_sqt) == (None, "no run of td7 on cheetah to compare with")
 
 
-def test_coefficient_zero_stands_in_for_a_base_that_was_not_run(tmp_path):
+def test_coefficient_zero_takes_the_place_of_a_baseline_that_was_not_run(tmp_path):
     write_run(tmp_path, "td3_sqt", curves=[[0, 1, 1], [0, 2, 2]], swept={"penalty_coef": (0.0, 0.5)})
     write_run(tmp_path, "td3_sqt_tuple")
     found = collect([str(tmp_path)])
-    zero, half, tuple_form = found.groups
-    for group in (half, tuple_form):
-        assert found.base(group).group is zero
-        assert "no run of td3: td3_sqt at penalty_coef 0, which trains the same, is its base" in found.base(group).note
+    zero, half, sqt_tuple = found.groups
+    for group in (half, sqt_tuple):
+        baseline = found.baseline(group)
+        assert baseline.group is zero
+        assert baseline.note == "no run of td3: compared with td3_sqt at penalty_coef 0, which trains the same"
 
 
 def test_counterparts(tmp_path):
@@ -156,10 +158,10 @@ def test_counterparts(tmp_path):
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_the_base_of_a_name_is_its_row_without_the_penalty(algo):
-    base = ALGORITHMS[base_algorithm(algo)]
+def test_a_rows_baseline_is_the_same_row_without_the_penalty(algo):
+    baseline = ALGORITHMS[baseline_of(algo)]
     own = {name: value for name, value in ALGORITHMS[algo].settings.items() if not name.startswith("penalty")}
-    assert (base.make_agent, base.settings, base.training) == (
+    assert (baseline.make_agent, baseline.settings, baseline.training) == (
         ALGORITHMS[algo].make_agent,
         own,
         ALGORITHMS[algo].training,

@@ -146,7 +146,7 @@ def test_without_a_penalty_sqt_is_maxmin_bit_for_bit():
 def test_tables_that_learn_from_the_same_transitions_are_q_learning_whatever_the_coefficient():
     (shared, learner), (_, plain) = swept()["sqt_shared"], swept()["q_learning"]
     assert not shared.std.any()
-    # between two programs, but for rounding
+    # between two programs, except for rounding
     np.testing.assert_allclose(learner.tables, np.broadcast_to(plain.tables, learner.tables.shape), atol=1e-5)
 
 

@@ -54,7 +54,7 @@ def test_it_is_replaced_only_where_asked(runs, tmp_path, capsys):
 def test_what_was_left_out_is_said(runs, tmp_path, capsys):
     (runs / "cheetah" / "td3" / "run" / "config.json").unlink()
     assert main(["report", str(runs), f"--out={tmp_path / 'report.html'}"]) == 0
-    assert "td3/run has an evaluations.csv, but no config.json" in capsys.readouterr().err
+    assert "td3/run has an evaluations.csv but no config.json" in capsys.readouterr().err
 
 
 def test_what_a_run_says_is_never_markup(runs, tmp_path):
@@ -73,7 +73,7 @@ def test_what_a_run_says_is_never_markup(runs, tmp_path):
     ("argv", "message"),
     [
         ([], "RUNS: expects folders of runs or folders above them, as in python -m experiments.report"),
-        (["none"], "none: there is no such folder"),
+        (["none"], "none: does not exist"),
         (["runs", "--out="], "--out: expects a file"),
         (["runs", "--out=runs"], "--out=runs: expects a file, which this folder is not"),
         (["runs", "--out=runs/cheetah/td3/run/config.json/x"], "expects a file"),

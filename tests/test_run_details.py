@@ -42,7 +42,7 @@ def test_what_config_json_says(tmp_path):
         "evaluated on": "mujoco",
         "preset": "paper",
         "device": "cpu, 2 CPUs",
-        "commit": "abc, with changes that are in no commit",
+        "commit": "abc, with uncommitted changes",
     }
     (command,) = found.commands
     assert command.text == "python -m experiments.run --algo=td3_sqt '--name=a b;$(c)'"
@@ -69,7 +69,7 @@ def test_what_is_swept_and_what_diverged(tmp_path):
     ]
 
 
-def test_a_run_that_was_gone_on_with_has_all_its_commands(tmp_path):
+def test_a_resumed_run_has_all_its_commands(tmp_path):
     resumed = [
         {"env_steps": 1000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.10.2"}},
         {"env_steps": 2000, "command": ["run.py", "--resume=x"], "versions": {"jax": "0.11", "brax": "1"}},
@@ -78,16 +78,16 @@ def test_a_run_that_was_gone_on_with_has_all_its_commands(tmp_path):
     ]
     first, second, other, third, fourth = details(write_run(tmp_path), resumed=resumed).commands
     assert first.text is None  # made runs have none
-    assert second == ("python -m experiments.run --resume=x", "and was gone on with at step 1,000 by", "")
-    assert other.note == "From there on with other versions: jax 0.11, brax 1."
-    assert third.label == "and was gone on with from the start by" and "read flags from a file" in third.note
-    assert fourth.text is None and "No command" in fourth.note
+    assert second == ("python -m experiments.run --resume=x", "Resumed at step 1,000 with", "")
+    assert other.note == "Other versions from there on: jax 0.11, brax 1."
+    assert third.label == "Resumed from the start with" and "read flags from a file" in third.note
+    assert fourth.text is None and "no command" in fourth.note
 
 
 @pytest.mark.parametrize("command", [None, [], ["run"], "run --algo=td3", ["run", 3], {"a": 1}])
 def test_what_is_not_recorded_is_said(tmp_path, command):
     found = details(write_run(tmp_path), command=command, device=3)
-    assert found.commands[0].text is None and "No command that could be repeated" in found.commands[0].note
+    assert found.commands[0].text is None and "no command that can be repeated" in found.commands[0].note
     assert {found.facts[name] for name in ("began", "device", "commit")} == {"not recorded in config.json"}
 
 
@@ -116,14 +116,14 @@ def test_training_and_speed_are_the_last_processs_where_there_were_several(tmp_p
     (path / "summary.json").write_text(
         '{"status": "done", "wall_seconds": 90, "train_seconds": 20, "steps_per_second": 500}'
     )
-    names = {"of that training": "20.0 s", "speed": "500 training steps/s", "took": "90.0 s"}
+    names = {"training": "20.0 s", "speed": "500 training steps/s", "took": "90.0 s"}
     assert names.items() <= details(path).facts.items()
     facts = details(path, resumed=[{"env_steps": 50}]).facts
     names = {"training of the last process": "20.0 s", "speed of the last process": "500 training steps/s"}
     assert (names | {"took": "90.0 s"}).items() <= facts.items()
-    assert not {"of that training", "speed"} & facts.keys()
+    assert not {"training", "speed"} & facts.keys()
 
 
-def test_no_run_is_refused(tmp_path):
+def test_a_folder_without_a_run_is_rejected(tmp_path):
     with pytest.raises(UsageError, match=r"it has no config.json that can be read"):
         run_details.read(tmp_path, [])

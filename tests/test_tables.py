@@ -22,9 +22,9 @@ def test_all_tables_are_shown(runs, capsys):
     for piece in (
         "Table 1: sizes",
         "Table 2: maximum",
-        "SQT against its base",
+        "SQT variants against their",
         "Table 3: dis",
-        "Table 4: the",
+        "Table 4: SQT",
         "Seeds",
     ):
         assert piece in shown
@@ -66,7 +66,7 @@ def test_every_format_is_written_and_replaced_only_where_asked(runs, tmp_path, c
     ("argv", "message"),
     [
         ([], "RUNS: expects folders of runs"),
-        (["none"], "none: there is no such folder"),
+        (["none"], "none: does not exist"),
         (["runs", "--format=html"], "--format: expects one of terminal, markdown, csv, latex, not 'html'"),
         (["runs", "--referense"], "--referense: unknown flag; did you mean --reference?"),
         (["runs", "--out=runs/cheetah/td3/run/config.json"], "expects a folder, which this is not"),
@@ -81,10 +81,10 @@ def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, c
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_two_runs_with_the_same_seed_are_refused(runs, capsys):
+def test_two_runs_with_the_same_seed_are_rejected(runs, capsys):
     write_run(runs / "again", "td3")
     assert main(["tables", str(runs)]) == 2
-    assert "both hold seed 0 of td3 on cheetah with the same settings" in capsys.readouterr().err
+    assert "both have seed 0 of td3 on cheetah with the same settings" in capsys.readouterr().err
 
 
 def test_a_typing_error_is_answered_without_jax():

@@ -1,10 +1,10 @@
 """The command from end to end."""
 
-import numpy as np
 import pytest
 from matplotlib.image import imread
 
 from experiments import tabular
+from experiments.theorem import study_flags
 
 
 def test_the_command_from_end_to_end(tmp_path, capsys):
@@ -20,10 +20,9 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
     assert sorted(path.name for path in out.iterdir()) == ["table.md", "tabular.png"]
 
     assert tabular.main([*argv, f"--out={out}"]) == 2
-    assert (
-        capsys.readouterr().err == f"--out={out}: is there already; expects another folder, or --overwrite beside it\n"
-    )
-    assert tabular.parse([*argv, f"--out={out}", "--overwrite"])["overwrite"]
+    assert capsys.readouterr().err == f"--out={out}: exists; expects another folder, or also --overwrite\n"
+    settings, folder = study_flags.parse([*argv, f"--out={out}", "--overwrite"])
+    assert (settings.coefs, settings.steps, folder) == ((0.0, 0.5), 400, out)
 
 
 @pytest.mark.parametrize(
@@ -32,20 +31,20 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
         ("--mdps=maze", "--mdps: expects one of random, chain, grid, not 'maze'"),
         ("--mdps=", "--mdps: expects at least one"),
         ("--algos=q_learning,sarsa", "--algos: expects one of q_learning, "),
-        ("--coefs=0,-1", "--coefs: expects numbers of at least 0 like 0,0.5, not '-1'"),
+        ("--coefs=0,-1", "--coefs: expects numbers of at least 0 like 0,0.5, got '-1'"),
         ("--coefs=nan", "--coefs: expects numbers of at least 0"),
-        ("--coefs=0,0.0", "--coefs: expects each value once, 0.0 is there 2 times"),
+        ("--coefs=0,0.0", "--coefs: expects each value once, got 0.0 2 times"),
         ("--seeds=0", "--seeds: expects an integer in the range [1, 10000]"),
         ("--seeds=many", "--seeds: expects an integer in the range [1, 10000]"),
         ("--steps=1", "--steps: expects an integer in the range [100, 100000000]"),
         ("--tables=1", "--tables: expects an integer in the range [2, 100]"),
         ("--greedy=max", "--greedy: expects one of min, mean, penalised, not 'max'"),
-        ("--gamma=1", "--gamma: expects a number above 0 and below 1, not 1"),
-        ("--gamma=0", "--gamma: expects a number above 0 and below 1, not 0"),
+        ("--gamma=1", "--gamma: expects a number above 0 and below 1, got 1"),
+        ("--gamma=0", "--gamma: expects a number above 0 and below 1, got 0"),
         ("--gamma=nan", "--gamma: expects a number"),
-        ("--lr_power=0.5", "--lr_power: expects a number above 0.5 and up to 1, not 0.5"),
+        ("--lr_power=0.5", "--lr_power: expects a number above 0.5 and up to 1, got 0.5"),
         ("--epsilon=2", "--epsilon: expects a number in the range [0.0, 1.0]"),
-        ("--weighted_c=0", "--weighted_c: expects a number above 0, not 0"),
+        ("--weighted_c=0", "--weighted_c: expects a number above 0, got 0"),
         ("--overwrite=3", "--overwrite: expects true or false"),
         ("--out=", "--out: expects a folder"),
         (f"--out={__file__}", f"--out={__file__}: expects a folder, which this is not"),
@@ -56,15 +55,15 @@ def test_the_command_from_end_to_end(tmp_path, capsys):
         ("5", "5: unexpected argument"),
     ],
 )
-def test_a_wrong_flag_is_told_in_one_line_before_anything_runs(argument, message, capsys, tmp_path, monkeypatch):
+def test_a_wrong_flag_is_rejected_in_one_line_before_anything_runs(argument, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert tabular.main(["tabular", argument]) == 2
-    told = capsys.readouterr()
-    assert told.err.startswith(message) and told.err.count("\n") == 1 and not told.out
+    shown = capsys.readouterr()
+    assert shown.err.startswith(message) and shown.err.count("\n") == 1 and not shown.out
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_in_the_place_of_a_result_is_refused_before_anything_runs(tmp_path, capsys):
+def test_a_folder_in_the_place_of_a_result_is_rejected_before_anything_runs(tmp_path, capsys):
     (tmp_path / "tabular.png").mkdir()
     assert tabular.main(["tabular", f"--out={tmp_path}", "--overwrite"]) == 2
     assert capsys.readouterr().err.startswith(f"--out={tmp_path}: tabular.png is a folder; expects a folder without it")
@@ -73,12 +72,4 @@ def test_a_folder_in_the_place_of_a_result_is_refused_before_anything_runs(tmp_p
 def test_help_names_every_flag(capsys):
     assert tabular.main(["tabular", "--help"]) == 0
     shown = capsys.readouterr().out
-    assert all(f"--{name}" in shown or f"--[no]{name}" in shown for name in tabular.define_flags())
-
-
-def test_checkpoints_lie_evenly_in_the_logarithm_and_end_with_the_last_step():
-    for steps in (100, 101, 3000, 200_000):
-        found = tabular.checkpoints(steps)
-        assert found[0] == 100 and found[-1] == steps and (np.diff(found) > 0).all()
-    ratios = np.diff(np.log(tabular.checkpoints(100_000)))
-    assert ratios == pytest.approx(np.log(10) / 8, rel=0.02)
+    assert all(f"--{name}" in shown or f"--[no]{name}" in shown for name in study_flags.define_flags())

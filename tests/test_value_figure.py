@@ -4,8 +4,8 @@ from made_curves import curves
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from experiments.theorem.claims import interval
-from experiments.theorem.value_figure import STYLES, _draw, _dress, draw
+from experiments.theorem.learning_curves import interval
+from experiments.theorem.value_figure import STYLES, _draw, _style_axes, draw
 
 
 def test_an_algorithm_has_its_colour_and_an_mdp_its_column(tmp_path):
@@ -25,7 +25,7 @@ def test_a_band_is_the_interval_and_only_the_axis_cuts_it():
     found = curves(error=(9.0, 3.0, 1.0))
     found.record.error_max[0] *= 8  # one seed far from the others: the interval reaches below 0
     _draw(axes, "q_learning", found, "error_max")
-    _dress(axes, "error_max")
+    _style_axes(axes, "error_max")
     (band,) = axes.collections
     mean, width = interval(found.record.error_max[:, 0, 0])
     assert band.get_paths()[0].vertices[:, 1].min() == pytest.approx(mean - width) and mean < width

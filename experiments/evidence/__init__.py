@@ -1,1 +1,1 @@
-"""What finished runs show: read and pooled, as tables, figures and the report's page, beside published results."""
+"""Finished runs as evidence: pooled over seeds, and shown as tables, figures and a page."""

@@ -1,4 +1,4 @@
-"""What tables are made of: cells, lines, footnotes, and how a number is written."""
+"""The parts of a result table: cells, lines, footnotes, and how numbers are written."""
 
 import math
 from collections.abc import Iterable
@@ -7,32 +7,38 @@ from typing import Any, NamedTuple
 import numpy as np
 
 NOTHING = "-"
-# Of every interval of a score: the maximum over evaluations is optimistic, and the interval does not show it.
-NOT_RESAMPLED = "that the score's evaluation was chosen is not resampled"
+# Said of every interval of a score: the maximum over evaluations is optimistic, and the interval does not show that.
+NOT_RESAMPLED = "the choice of the score's evaluation is not resampled"
 
 
 class Cell(NamedTuple):
+    """A cell's text and the numbers of its footnotes."""
+
     lines: tuple[str, ...]
-    marks: tuple[int, ...] = ()  # footnotes
+    marks: tuple[int, ...] = ()
 
 
 class Line(NamedTuple):
+    """A line of a table; `published`: not of our runs."""
+
     cells: list[Cell]
     published: bool = False
 
 
-class Table(NamedTuple):
+class ResultTable(NamedTuple):
+    """A table with its caption and footnotes, before a format is chosen."""
+
     name: str  # of its files
     title: str
     header: list[str]
     sections: list[list[Line]]
     caption: str
-    notes: list[str]  # footnotes, the first is number 1
-    records: list[dict[str, Any]]  # the full numbers, a row of the CSV each
+    notes: list[str]  # footnotes; the first has number 1
+    records: list[dict[str, Any]]  # the unrounded numbers, one per row of the CSV
 
 
 class Notes:
-    """Footnotes in the order in which they are first referred to."""
+    """Footnotes in the order of their first use; calling it with texts gives their numbers."""
 
     def __init__(self, texts: Iterable[str] = ()):
         self.texts = list(texts)
@@ -45,7 +51,7 @@ class Notes:
 
 
 def number(value: float | None, sign: bool = False) -> str:
-    """`4,275`, `65.3` or `0.86`: three digits or all before the point."""
+    """`4,275`, `65.3` or `0.86`: three significant digits, and all digits before the point. `-` for None and NaN."""
     if value is None or not math.isfinite(value):
         return NOTHING
     digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
@@ -53,14 +59,15 @@ def number(value: float | None, sign: bool = False) -> str:
 
 
 def interval(low: float | None, high: float | None) -> str:
-    """In brackets; nothing where there is none."""
+    """`[3.00, 12.5]`; empty where there is no interval."""
     return "" if low is None or high is None else f"[{number(low)}, {number(high)}]"
 
 
 def joined(values: Iterable[Any]) -> str:
-    """Numbers of the seeds, for one field of a CSV."""
+    """The seeds' values as one field of a CSV."""
     return " ".join(f"{value:.10g}" for value in values)
 
 
 def finite(value: Any) -> float | None:
+    """`value`, or None where it is None, NaN or infinite."""
     return float(value) if value is not None and np.isfinite(value) else None

@@ -1,4 +1,7 @@
-"""How scores and std_T compare, in per cent and as a probability: with the base's, and of one form with another's."""
+"""Comparisons of scores and std_T, in per cent and as a probability.
+
+Either an SQT variant against its baseline, or two SQT variants of one baseline against each other.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -12,25 +15,32 @@ from experiments.evidence.cells import (
     Cell,
     Line,
     Notes,
-    Table,
+    ResultTable,
     finite,
     interval,
     joined,
     number,
 )
-from experiments.evidence.pooling import PENALTY, Collected, Group, Row, base_algorithm, differing
+from experiments.evidence.groups import PENALTY, Group, differences_text
+from experiments.evidence.pooling import AlgorithmRow, Collected
+from experiments.evidence.variants import BATCH_STD, TRANSITION_STD, baseline_of, variant_with
 
 
 class Comparison(NamedTuple):
-    """One group against another of the same task; `other` is None where there is none, and `note` says why."""
+    """A group and the group of the same task that it is compared with."""
 
     group: Group
-    other: Group | None
-    note: str = ""
+    other: Group | None  # None: there is none
+    note: str = ""  # why, where `other` is None
 
 
-def versus_base(collected: Collected, reference: bool, name: str) -> Table:
-    """Each algorithm with a penalty against its base: the score (table 2), or the disagreement (table 3)."""
+def against_baseline(collected: Collected, reference: bool, name: str) -> ResultTable:
+    """Each SQT variant against its baseline.
+
+    Args:
+      reference: also show the paper's mean improvements.
+      name: of the table, and so what is compared: `table2_improvement` is the score, `table3_change` std_T.
+    """
     score = name == "table2_improvement"
     what = "score" if score else "std_T"
     values_of: Callable[[Group], np.ndarray | None] = (
@@ -39,23 +49,26 @@ def versus_base(collected: Collected, reference: bool, name: str) -> Table:
     notes = Notes()
     lines, records = [], []
     for row in collected.rows:
-        if not has_penalty(row):
+        if row.penalty is None or baseline_of(row.algo) == row.algo:  # an unknown algorithm has no baseline
             continue
         pairs = {}
         for task, group in row.groups.items():
-            base = collected.base(group)
-            pairs[task] = Comparison(group, base.group, base.note)
+            baseline = collected.baseline(group)
+            pairs[task] = Comparison(group, baseline.group, baseline.note)
         line, found = _compared(
-            f"{row.label} against {base_algorithm(row.algo)}", pairs, collected.tasks, values_of, notes
+            f"{row.label} against {baseline_of(row.algo)}", pairs, collected.tasks, values_of, notes
         )
         lines.append(line)
         records += found
     if reference and lines:
         numbers = published.paper()
         if score:
-            quoted = {f"{algo}_sqt": v for algo, v in numbers["table2_improvement_percent_mean_over_tasks"].items()}
             shown = {row.algo for row in collected.rows}
-            quoted = {f"{algo} against {base_algorithm(algo)}": v for algo, v in quoted.items() if algo in shown}
+            quoted = {
+                f"{variant} against {baseline}": value
+                for baseline, value in numbers["table2_improvement_percent_mean_over_tasks"].items()
+                if (variant := variant_with(baseline, BATCH_STD)) in shown
+            }
         else:
             quoted = {"with SQT against without": numbers["table3_q_std"]["mean_improvement_percent"]}
         for label, value in quoted.items():
@@ -64,25 +77,30 @@ def versus_base(collected: Collected, reference: bool, name: str) -> Table:
             lines.append(Line([*cells, Cell((f"{number(value, sign=True)} %",)), Cell((NOTHING,))], published=True))
             over_tasks = {"env": "mean over tasks", "improvement_percent": value, "source": published.PAPER}
             records.append({"comparison": label} | over_tasks)
-    many = f"by how many per cent the mean {what} of the seeds exceeds the base's"
-    caption = f"Per task: {many}, and P, the probability that a seed exceeds a seed of the base (a tie counts a half)."
-    title = "Table 2, SQT against its base: score" if score else "Table 3, SQT against its base: std_T"
+    caption = (
+        f"Per task: by how many per cent the mean {what} over seeds exceeds the baseline's, and P, the probability "
+        "that a seed exceeds a seed of the baseline (a tie counts one half)."
+    )
+    title = f"{'Table 2' if score else 'Table 3'}, SQT variants against their baselines: {what}"
     header = ["comparison", *collected.tasks, "mean over tasks", "P over tasks"]
     if len(collected.tasks) == 1 and not any(line.published for line in lines):
         header, lines = header[:-2], [Line(line.cells[:-2]) for line in lines]
     else:
-        caption += " The last columns: the means of these over the tasks compared."
-    caption += " In brackets: 95 % intervals by stratified bootstrap, tasks and algorithms being the strata"
+        caption += " Last columns: the means over the tasks that can be compared."
+    caption += " In brackets: 95 % intervals by bootstrap over seeds, stratified by algorithm and task"
     caption += f"; {NOT_RESAMPLED}." if score else "."
-    return Table(name, title, header, [lines] if lines else [], caption, notes.texts, records)
+    return ResultTable(name, title, header, [lines] if lines else [], caption, notes.texts, records)
 
 
-def forms_compared(rows: Sequence[Row], collected: Collected, notes: Notes) -> tuple[list[Line], list[dict[str, Any]]]:
-    """The scores of the rows against those of their tuple forms: lines of table 4, and the full numbers."""
+def variants_compared(
+    rows: Sequence[AlgorithmRow], collected: Collected, notes: Notes
+) -> tuple[list[Line], list[dict[str, Any]]]:
+    """The scores of SQT against those of SQT-tuple with the same baseline: lines of table 4, and the full numbers."""
     lines, records = [], []
     for row in rows:
         for other in rows:
-            if other.algo != f"{row.algo}_tuple":
+            same = baseline_of(row.algo) == baseline_of(other.algo)
+            if not same or (row.penalty, other.penalty) != (BATCH_STD, TRANSITION_STD):
                 continue
             pairs = {}
             for task, group in row.groups.items():
@@ -90,22 +108,17 @@ def forms_compared(rows: Sequence[Row], collected: Collected, notes: Notes) -> t
                 if alike:
                     pairs[task] = Comparison(group, alike[0])
                 elif task in other.groups:
-                    why = differing(group, other.groups[task], PENALTY)
+                    why = differences_text(group, other.groups[task], PENALTY)
                     pairs[task] = Comparison(group, None, f"not compared: {why}")
             label = f"{row.label} against {other.label}"
             line, found = _compared(label, pairs, collected.tasks, lambda group: group.scores, notes)
-            # The last two cells are over tasks, for which there are no columns here: beneath the label instead.
+            # This table has no columns for the last two cells, which are over tasks: they stand under the label.
             over_tasks = [cell for cell in line.cells[-2:] if cell.lines != (NOTHING,)]
             words = [f"over tasks: {' '.join(cell.lines)}" for cell in over_tasks] if len(collected.tasks) > 1 else []
             line.cells[0] = Cell((label, *words))
             lines.append(Line([*line.cells[:-2], *(Cell(("",)) for _ in range(3))]))
             records += found
     return lines, records
-
-
-def has_penalty(row: Row) -> bool:
-    found = [group.settings for group in row.groups.values()]
-    return any(settings["penalty"] != "none" and settings["penalty_coef"] > 0 for settings in found)
 
 
 def _compared(
@@ -115,11 +128,15 @@ def _compared(
     values_of: Callable[[Group], np.ndarray | None],
     notes: Notes,
 ) -> tuple[Line, list[dict[str, Any]]]:
-    """A line of comparisons, its last two cells over all tasks that can be compared, and the full numbers."""
+    """A line of comparisons and the full numbers. The last two cells are over all tasks that can be compared.
+
+    Args:
+      values_of: the values of a group that are compared, [seeds], or None.
+    """
     cells, records, strata, all_marks = [Cell((label,))], [], [], set()
     for task in tasks:
         if task not in pairs:
-            cells.append(Cell((NOTHING,), notes("no such run")))
+            cells.append(Cell((NOTHING,), notes("not run")))
             continue
         group, other, note = pairs[task]
         why = [note] if note else []
@@ -127,7 +144,7 @@ def _compared(
         if other is not None:
             why += [f"{one.algo} on {task}: {note}" for one in (group, other) for note in one.notes]
         if x is None or y is None or other is None:
-            cells.append(Cell((NOTHING,), notes(*(why or ["nothing measured that could be compared"]))))
+            cells.append(Cell((NOTHING,), notes(*(why or ["not measured"]))))
             continue
         found = _against(x, y)
         why += _percentage_notes(found)
@@ -153,11 +170,12 @@ def _compared(
 
 
 def _against(*strata: np.ndarray) -> dict[str, float | None]:
+    """Improvement and probability, each with its interval, of `x, y` of a task, then of the next; [seeds] each."""
     statistic = {"improvement": statistics.improvement, "probability": statistics.probability_of_improvement}
     found: dict[str, float | None] = {}
     for name, function in statistic.items():
         key = "improvement_percent" if name == "improvement" else "probability_of_improvement"
-        # A seed that is alone is drawn again and again: the interval would leave that side's spread out.
+        # With a single seed every resample is the same: the interval would show no spread on that side.
         single = any(len(stratum) == 1 for stratum in strata)
         low, high = (None, None) if single else statistics.bootstrap(function, *strata)
         found |= {key: finite(function(*strata)), f"{name}_low": finite(low), f"{name}_high": finite(high)}

@@ -1,7 +1,7 @@
-"""Figures of runs. Without pyplot: no global state, no display."""
+"""Figures of runs. They do without pyplot, and so without global state and a display."""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,20 +17,20 @@ from experiments.evidence.cells import NOT_RESAMPLED
 from experiments.evidence.figure_style import (
     COLOURS,
     LINES,
+    NAMES,
+    STATISTICS,
     Stars,
     Style,
-    dress,
-    finish,
-    handle,
+    add_texts,
     make_panels,
+    style_axes,
     styles,
-    wrapped,
 )
-from experiments.evidence.pooling import Collected, Group, Row, differences, setting_text
+from experiments.evidence.groups import Group
+from experiments.evidence.penalty_figure import penalty_sweep
+from experiments.evidence.pooling import Collected
 
 BAND_RESAMPLES = 1000
-STATISTICS = {"iqm": statistics.iqm, "mean": statistics.mean}
-NAMES = {"iqm": "interquartile mean", "mean": "mean"}
 LABELS = {
     "return_mean": "return of an evaluation episode",
     "q_std": "std over critics, Q(s, a)",
@@ -39,12 +39,13 @@ LABELS = {
 
 
 def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None:
-    """Writes the return and the critics' disagreement of one run over the environment steps as a PNG.
+    """Writes one run's figure as a PNG: the return and the critics' disagreement over the environment steps.
 
-    A colour per group: the mean over its members, a band of one population std, and a thin line per member.
+    A colour per group (the seeds with one value of each swept setting): the mean over seeds, a band of one std over
+    seeds (ddof 0, population), and a thin line per seed.
 
     Args:
-      table: the columns of evaluations.csv (`records.read_evaluations`).
+      table: the columns of evaluations.csv (`records.read_evaluations`), [rows] each.
     """
     from experiments.running.records import groups, of_member, swept_columns  # brings JAX
 
@@ -67,16 +68,20 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
             axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", color="0.4")
             axes.set_yticks([])
         axes.set_xlabel("environment steps per member")
-        dress(axes)
+        style_axes(axes)
     left.set_ylabel(LABELS["return_mean"])
     right.set_ylabel(LABELS["q_std"])
     left.legend(frameon=False, fontsize="small", loc="best")
-    figure.suptitle(f"{title}: mean and std over seeds, thin lines the seeds", fontsize="medium")
+    figure.suptitle(f"{title}: mean and std (ddof 0) over seeds, thin lines: the seeds", fontsize="medium")
     figure.savefig(path)
 
 
-def every(collected: Collected, statistic: str) -> dict[str, Callable[[], Figure | None]]:
-    """All figures by name, each as what draws it; that gives None where there is nothing to show."""
+def all_figures(collected: Collected, statistic: str) -> dict[str, Callable[[], Figure | None]]:
+    """All figures by name, each as a function that draws it; it returns None where there is nothing to draw.
+
+    Args:
+      statistic: over seeds, `iqm` or `mean`.
+    """
     biases = [column for group in collected.groups for column in group.columns("value_bias")]
     columns = dict.fromkeys(["return_mean", "q_std", *biases])
     draw: dict[str, Callable[[], Figure | None]] = {
@@ -89,9 +94,9 @@ def every(collected: Collected, statistic: str) -> dict[str, Callable[[], Figure
 
 
 def over_time(collected: Collected, column: str, statistic: str) -> Figure | None:
-    """A column of evaluations.csv over the env steps, a panel per task; None where no run has measured it.
+    """A column of evaluations.csv over the env steps, one panel per task; None where no run has measured it.
 
-    The statistic over seeds at each evaluation that all of them have, and its 95 % bootstrap interval as a band.
+    Lines are the statistic over seeds at each evaluation that all seeds have, bands its 95 % bootstrap interval.
     """
     rows = [row for row in collected.rows if any(np.isfinite(g.values(column)).any() for g in row.groups.values())]
     if not rows:
@@ -106,71 +111,18 @@ def over_time(collected: Collected, column: str, statistic: str) -> Figure | Non
             stars.add(row.label, f"{row.label} on {panel.task}", group.notes)
         if column.startswith("value_bias"):
             panel.axes.axhline(0, color="0.4", linewidth=0.8, zorder=1)
-        dress(panel.axes)
+        style_axes(panel.axes)
     name = LABELS.get(column, column.replace("_", " "))
     heading = f"{name[0].upper()}{name[1:]}: {NAMES[statistic]} over seeds, band: its 95 % bootstrap interval"
-    finish(figure, panels, style, stars, heading, "environment steps per member", name)
-    return figure
-
-
-def penalty_sweep(collected: Collected, statistic: str) -> Figure | None:
-    """The score against `penalty_coef`, seeds as dots, a panel per task; None where nothing was swept.
-
-    Drawn are groups that are alike in everything but `penalty_coef`, and the plain algorithm's at 0.
-    """
-    sweeps: dict[str, list[list[Group]]] = {}
-    for task in collected.tasks:
-        remaining = [group for group in collected.groups if group.env == task and group.settings["penalty"] != "none"]
-        while remaining:
-            alike = [g for g in remaining if not differences(remaining[0], g, {"penalty_coef"})]
-            remaining = [group for group in remaining if group not in alike]
-            if len(alike) > 1:
-                sweeps.setdefault(task, []).append(sorted(alike, key=lambda group: group.settings["penalty_coef"]))
-    if not sweeps:
-        return None
-    # One row per algorithm, whatever its coefficients.
-    rows = [Row(algo, algo, {}) for algo in dict.fromkeys(row.algo for row in collected.rows)]
-    style, stars = styles(rows), Stars()
-    columns = min(len(sweeps), 4)
-    count = -(-len(sweeps) // columns)
-    figure = Figure(figsize=(1.6 + 3.9 * columns, 0.9 + 3.2 * count), dpi=150, layout="constrained")
-    grid = figure.subplots(count, columns, squeeze=False)
-    for axes in grid.flat[len(sweeps) :]:
-        axes.set_visible(False)
-    drawn: list[Group] = []
-    for (task, found), axes in zip(sweeps.items(), grid.flat, strict=False):
-        axes.set_title(task, fontsize="medium")
-        lines = []
-        for alike in found:
-            base = collected.base(alike[0]).group
-            plain = base and base.settings["penalty"] == "none" and alike[0].settings["penalty_coef"] > 0
-            lines.append([base, *alike] if base and plain else alike)
-        coefs = sorted({group.settings["penalty_coef"] for line in lines for group in line})
-        for index, line in enumerate(lines):
-            shift = (index - (len(lines) - 1) / 2) * 0.12
-            _draw_sweep(axes, line, coefs, shift, statistic, style, drawn)
-            for group in line:
-                coef = setting_text(group.settings["penalty_coef"])
-                stars.add(group.algo, f"{group.algo} at {coef} on {task}", group.notes)
-        # As far apart as they are many: coefficients are often chosen as powers.
-        axes.set_xticks(range(len(coefs)), [setting_text(coef) for coef in coefs])
-        dress(axes, steps=False)
-    algos = {group.algo for group in drawn}
-    handles = [handle(style[row.label], stars.starred(row.label), "o") for row in rows if row.algo in algos]
-    figure.legend(handles=handles, frameon=False, fontsize="small", loc="outside right center", handlelength=3)
-    heading = f"Score against penalty_coef: {NAMES[statistic]} and its 95 % bootstrap interval, dots: seeds"
-    heading += f"; {NOT_RESAMPLED}"
-    figure.suptitle(wrapped(figure, heading), fontsize="medium")
-    width = int(figure.get_figwidth() * 13)
-    figure.supxlabel("\n".join(["penalty_coef", *stars.lines(width)]), fontsize="small")
-    figure.supylabel("return at the score's evaluation", fontsize="small")
+    add_texts(figure, panels, style, stars, heading, "environment steps per member", name)
     return figure
 
 
 def performance_profile(collected: Collected) -> Figure | None:
-    """The share of seeds above each fraction of the best score, tasks weighing the same; None without scores.
+    """The share of seeds above each fraction of the best score, with equal weights of tasks; None without scores.
 
-    A task's scores are divided by the highest mean score among the rows. Rows without some task are left out and named.
+    A task's scores are divided by the highest mean score among the rows. A footnote names the rows that lack a task and
+    are left out.
     """
     best: dict[str, float] = {}
     for task in collected.tasks:
@@ -211,16 +163,16 @@ def performance_profile(collected: Collected) -> Figure | None:
                 )
             for task in best:
                 stars.add(row.label, f"{row.label} on {task}", row.groups[task].notes)
-        dress(axes, steps=False)
+        style_axes(axes, steps=False)
         axes.set_ylim(-0.02, 1.02)
     heading = f"Performance profile over {', '.join(best)}; band: 95 % stratified bootstrap; {NOT_RESAMPLED}"
     below = "τ: score as a fraction of the best algorithm's mean on the task"
-    finish(figure, panels, style, stars, heading, below, "share of seeds above τ")
+    add_texts(figure, panels, style, stars, heading, below, "share of seeds above τ")
     return figure
 
 
 def image(figure: Figure, kind: str) -> bytes:
-    """The figure as `png`, `svg` or `pdf`; a figure drawn anew gives the same PNG and SVG."""
+    """The figure as `png`, `svg` or `pdf`. Drawing a figure again gives the same bytes of PNG and SVG."""
     stream = io.BytesIO()
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind, {})
     with matplotlib.rc_context({"svg.hashsalt": "sqt_jax"}):  # else its ids are random
@@ -228,8 +180,15 @@ def image(figure: Figure, kind: str) -> bytes:
     return stream.getvalue()
 
 
+def file_contents(draw: Mapping[str, Callable[[], Figure | None]], kind: str) -> tuple[dict[str, bytes], list[str]]:
+    """The figures of `all_figures` as images by file name, and the names of those with nothing to draw."""
+    drawn = {name: function() for name, function in draw.items()}
+    contents = {f"{name}.{kind}": image(figure, kind) for name, figure in drawn.items() if figure}
+    return contents, [name for name, figure in drawn.items() if figure is None]
+
+
 def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
-    """A dollar in a version's name is a dollar: what a run's files say is not typeset."""
+    """Draws with texts as they are: a dollar sign in a run's files starts no formula."""
     with matplotlib.rc_context({"text.parse_math": False}):
         return draw()
 
@@ -252,42 +211,10 @@ def _draw_group(axes: Axes, group: Group, column: str, statistic: str, style: St
         axes.fill_between(env_steps, *band, color=style.colour, alpha=opacity, linewidth=0, zorder=2)
 
 
-def _draw_sweep(
-    axes: Axes,
-    line: Sequence[Group],
-    coefs: Sequence[float],
-    shift: float,
-    statistic: str,
-    style: Mapping[str, Style],
-    drawn: list[Group],
-) -> None:
-    """A line through the groups; a base that another line has `drawn` already is not drawn again."""
-    function = STATISTICS[statistic]
-    places, middles = [], []
-    for group in line:
-        if group.scores is None:
-            continue
-        place = coefs.index(group.settings["penalty_coef"]) + (shift if group.settings["penalty"] != "none" else 0.0)
-        middle = float(function(group.scores))
-        places.append(place)
-        middles.append(middle)
-        if any(group is other for other in drawn):
-            continue
-        drawn.append(group)
-        colour = style[group.algo].colour
-        dots = np.full(len(group.scores), place + 0.05)
-        axes.scatter(dots, group.scores, s=16, color=colour, alpha=0.45, linewidth=0, zorder=2)
-        if len(group.scores) > 1:
-            axes.plot([place, place], statistics.bootstrap(function, group.scores), color=colour, zorder=3)
-        axes.plot([place], [middle], "o", color=colour, markersize=6, zorder=4)
-    look = style[line[-1].algo]
-    axes.plot(places, middles, color=look.colour, linestyle=look.line, linewidth=1.4, zorder=3)
-
-
 def _draw_members(axes: Axes, env_steps: np.ndarray, values: np.ndarray, colour: str, line: str, label: str) -> None:
-    """`values` [members, evaluations]: their mean, a band of one population std, and thin lines."""
+    """`values` [members, evaluations]: their mean, a band of one std (ddof 0), and thin lines."""
     mean, std = values.mean(axis=0), values.std(axis=0)
-    # Where there is one point, or NaN around it, a line alone would show nothing.
+    # A single point, or one between NaNs, has no line: markers show it.
     marker = "o" if np.isfinite(mean).sum() < 30 else ""
     if len(values) > 1:
         for curve in values:

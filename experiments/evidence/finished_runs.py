@@ -1,4 +1,4 @@
-"""Finished runs on disk: found in and below folders, and read, a `Curves` for each seed."""
+"""Finds finished runs in and below folders, and reads a run's files as one `MemberCurves` per member."""
 
 import csv
 import math
@@ -10,45 +10,50 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.commandline.arguments import UsageError, printable
+from experiments.evidence import run_settings
 
 REQUIRED = ("member", "env_steps", "gradient_steps", "seed", "return_mean", "q_std")
 
 
-class Curves(NamedTuple):
-    """What one seed left."""
+class MemberCurves(NamedTuple):
+    """One member's settings and its rows of evaluations.csv."""
 
-    run: Path
+    run: Path  # the run's folder
     seed: int
-    settings: dict[str, Any]
-    versions: dict[str, str]
-    columns: dict[str, np.ndarray]  # of evaluations.csv, in the order of the env steps
+    settings: dict[str, Any]  # all by name, without the seed
+    versions: dict[str, str]  # of the packages
+    columns: dict[str, np.ndarray]  # [evaluations] each, in the order of the env steps
 
 
 def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """The folders with a config.json among `paths` and below them, each once; and what was left out."""
-    found: dict[Path, Path] = {}  # by their real paths
+    """The folders with a config.json among and below `paths`, each once, and notes on folders that were left out.
+
+    Raises:
+      UsageError: a path is not a folder, cannot be read, or holds no run.
+    """
+    found: dict[Path, Path] = {}  # by resolved path
     notes = []
     for text in paths:
         path = Path(text)
         try:
             if not path.is_dir():
-                what = "is no folder" if path.exists() else "there is no such folder"
-                raise UsageError(f"{text}: {what}; RUNS expects folders of runs or folders above them")
+                problem = "is not a folder" if path.exists() else "does not exist"
+                raise UsageError(f"{text}: {problem}; RUNS expects folders of runs or folders above them")
             below, without = _below(path)
         except (OSError, ValueError) as error:
             if isinstance(error, UsageError):
                 raise
             raise UsageError(f"{text}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
         if not below:
-            raise UsageError(f"{text}: holds no run (there is no config.json in it or below it)")
+            raise UsageError(f"{text}: contains no run (no config.json in it or below it)")
         for run in below:
             found.setdefault(run.resolve(), run)
-        notes += [f"left out: {folder} has an evaluations.csv, but no config.json" for folder in without]
+        notes += [f"left out: {folder} has an evaluations.csv but no config.json" for folder in without]
     return list(found.values()), notes
 
 
 def _below(path: Path) -> tuple[list[Path], list[Path]]:
-    """Folders with a config.json, and those with an evaluations.csv alone."""
+    """Folders with a config.json, and those with an evaluations.csv only."""
 
     def fail(error: OSError) -> None:
         raise error
@@ -57,22 +62,22 @@ def _below(path: Path) -> tuple[list[Path], list[Path]]:
     for parent, folders, names in os.walk(path, onerror=fail):
         folders.sort()
         if "config.json" in names:
-            folders.clear()  # its own, such as checkpoint/
+            folders.clear()  # the run's own folders, checkpoints for example
             runs.append(Path(parent))
         elif "evaluations.csv" in names:
             without.append(Path(parent))
     return runs, without
 
 
-def read_run(path: Path) -> list[Curves]:
-    """The members of a run that have an evaluation. Raises `UsageError` where its files cannot be understood."""
-    from experiments.running import run_config  # brings JAX
+def read_run(path: Path) -> list[MemberCurves]:
+    """The members of a run that have an evaluation.
 
+    Raises:
+      UsageError: config.json or evaluations.csv cannot be read or is damaged.
+    """
+    run = run_settings.read(path)
     try:
-        run = run_config.read(path)
         columns = _read_table(path / "evaluations.csv")
-    except run_config.NotDescribed as error:
-        raise UsageError(f"{path}: {error}") from None
     except OSError as error:
         raise UsageError(f"{path}: its evaluations.csv cannot be read ({error.strerror})") from None
     except ValueError as error:
@@ -80,39 +85,47 @@ def read_run(path: Path) -> list[Curves]:
     evaluated_on = run.content.get("evaluated_on")
     versions = {printable(name): printable(str(value)) for name, value in run.content["versions"].items()}
     found = []
-    for index, member in enumerate(run.members):
+    for index, (seed, settings) in enumerate(run.members):
         kept = columns["member"] == index
         if not kept.any():
             continue
         own = {name: column[kept] for name, column in columns.items()}
         order = np.argsort(own["env_steps"], kind="stable")
         own = {name: column[order] for name, column in own.items()}
-        if (np.diff(own["env_steps"]) == 0).any() or not (own["seed"] == member.seed).all():
-            raise UsageError(f"{path}: its evaluations.csv is damaged: member {index} has other rows than it should")
-        settings, rows = member.config.flat(), run.content["replay_rows"]
-        # A larger one trains the same; a run that was gone on with has that of its first steps.
+        if (np.diff(own["env_steps"]) == 0).any() or not (own["seed"] == seed).all():
+            raise UsageError(
+                f"{path}: its evaluations.csv is damaged: member {index} has rows twice or of another seed"
+            )
+        rows = run.content["replay_rows"]
+        # A replay that never overwrites trains the same, whatever its capacity. A resumed run keeps its first capacity.
         settings["replay_capacity"] = rows if rows < settings["steps"] else "all"
         if evaluated_on is not None:
             settings["eval_physics"] = evaluated_on
-        # Of a member that had diverged by then; runs of an earlier version wrote its frozen critics' values.
-        gone = np.isnan(own["return_mean"])
-        own |= {name: np.where(gone, np.nan, own[name]) for name in ("q_mean", "q_std", "value_bias") if name in own}
-        found.append(Curves(path, member.seed, settings, versions, own))
+        # Runs of an earlier version recorded the frozen critics of members that had diverged.
+        diverged = np.isnan(own["return_mean"])
+        critics = [name for name in ("q_mean", "q_std", "value_bias") if name in own]
+        own |= {name: np.where(diverged, np.nan, own[name]) for name in critics}
+        found.append(MemberCurves(run=path, seed=seed, settings=settings, versions=versions, columns=own))
     if not set(columns["member"]) <= set(range(len(run.members))):
-        raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that its config.json has not")
+        raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that config.json does not have")
     return found
 
 
 def _read_table(path: Path) -> dict[str, np.ndarray]:
-    """The columns of an evaluations.csv; a last line that was cut off is none. Raises `ValueError` or `OSError`."""
+    """The columns of an evaluations.csv, [rows] each; an incomplete last line is dropped.
+
+    Raises:
+      ValueError: it is damaged.
+      OSError: it cannot be read.
+    """
     text = path.read_text(encoding="utf-8")
     lines = [*csv.reader(text[: text.rfind("\n") + 1].splitlines())]
     if not lines:
         raise ValueError("it is empty")
     names, rows = lines[0], lines[1:]
-    for name in names:  # they become names of files, and text in figures
+    for name in names:  # they become file names, and texts in figures
         if not (name.isascii() and name.isidentifier()):
-            raise ValueError(f"{name[:40]!r} is no name of a column")
+            raise ValueError(f"{name[:40]!r} is not a column's name")
     for name in REQUIRED:
         if name not in names:
             raise ValueError(f"it has no column {name}")

@@ -1,17 +1,18 @@
-"""`cells.Table` as terminal output, markdown, CSV and LaTeX."""
+"""`cells.ResultTable` as terminal output, markdown, CSV and LaTeX."""
 
 import csv
 import io
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.padding import Padding
-from rich.table import Table as RichTable
+from rich.table import Table
 from rich.text import Text
 
-from experiments.evidence.cells import Cell, Table
+from experiments.evidence.cells import Cell, ResultTable
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -24,9 +25,9 @@ LATEX = {
 } | {character: f"\\{character}" for character in "&%$#_{}"}
 
 
-def rich_table(table: Table) -> Group:
-    """For a console of rich."""
-    shown = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
+def rich_table(table: ResultTable) -> Group:
+    """The table for a rich console."""
+    shown = Table(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
     for name in table.header:
         shown.add_column(name, overflow="fold")
     for lines in table.sections:
@@ -38,14 +39,16 @@ def rich_table(table: Table) -> Group:
     return Group(shown, *(Padding(text, (0, 2)) for text in below), Text(""))
 
 
-def terminal(table: Table, width: int = 200) -> str:
-    """As plain text, for a file or a pipe."""
+def terminal(table: ResultTable, width: int = 200) -> str:
+    """The table as plain text, for a file or a pipe."""
     stream = io.StringIO()
     Console(file=stream, width=width, color_system=None).print(rich_table(table))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
 
 
-def markdown(table: Table) -> str:
+def markdown(table: ResultTable) -> str:
+    """The table as Markdown, with footnotes as superscripts."""
+
     def text(cell: Cell) -> str:
         lines = "<br>".join(line.replace("|", "\\|") for line in cell.lines)
         return lines + (f" <sup>{_marks(cell)}</sup>" if cell.marks else "")
@@ -60,8 +63,8 @@ def markdown(table: Table) -> str:
     return "\n".join(rows).rstrip() + "\n"
 
 
-def comma_separated(table: Table) -> str:
-    """The full numbers: a row per cell, not per row of the table."""
+def comma_separated(table: ResultTable) -> str:
+    """The unrounded numbers as CSV: a row per cell, not per row of the table."""
     columns = dict.fromkeys(name for record in table.records for name in record)
     stream = io.StringIO()
     writer = csv.DictWriter(stream, list(columns), restval="", lineterminator="\n")
@@ -71,8 +74,8 @@ def comma_separated(table: Table) -> str:
     return stream.getvalue()
 
 
-def latex(table: Table) -> str:
-    """A `table` with a `tabular`; needs no package."""
+def latex(table: ResultTable) -> str:
+    """A LaTeX `table` with a `tabular`; it needs no package."""
 
     def text(cell: Cell) -> str:
         marks = f"\\textsuperscript{{{_marks(cell)}}}" if cell.marks else ""
@@ -101,12 +104,31 @@ def latex(table: Table) -> str:
     return "\n".join([*rows, r"\end{table}"]) + "\n"
 
 
-FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {
+FORMATS: dict[str, tuple[str, Callable[[ResultTable], str]]] = {
     "terminal": ("txt", terminal),
     "markdown": ("md", markdown),
     "csv": ("csv", comma_separated),
     "latex": ("tex", latex),
 }
+
+
+def file_names(tables: Sequence[str]) -> list[str]:
+    """The names of all files of the named tables, one per format."""
+    return [f"{name}.{suffix}" for name in tables for suffix, _ in FORMATS.values()]
+
+
+def file_contents(tables: Sequence[ResultTable]) -> dict[str, bytes]:
+    """The tables in all formats, by file name."""
+    return {f"{table.name}.{suffix}": write(table).encode() for table in tables for suffix, write in FORMATS.values()}
+
+
+def show(tables: Sequence[ResultTable], name: str) -> None:
+    """Prints the tables in a format of `FORMATS`; on a terminal, `terminal` has its width and styles."""
+    if name == "terminal" and sys.stdout.isatty():
+        for table in tables:
+            Console().print(rich_table(table))
+    else:
+        print("\n".join(FORMATS[name][1](table) for table in tables), end="")
 
 
 def _plain(cell: Cell) -> str:

@@ -1,6 +1,6 @@
-"""HTML as a tree of elements, so that no text can become markup, and figures as parts of such a tree.
+"""HTML as a tree of elements, and figures as elements of it.
 
-Names of runs and what their files say come from anywhere: they are only ever text or the value of an attribute.
+Texts from the files of runs are not trusted: they become text nodes or attribute values only, never markup.
 """
 
 import base64
@@ -12,16 +12,16 @@ from xml.etree.ElementTree import Element
 from experiments.commandline.arguments import printable
 
 SVG = "{http://www.w3.org/2000/svg}"
-# Of matplotlib's, and of no use in a page.
+# Elements of matplotlib's SVG that a page does not need.
 LEFT_OUT = {"metadata", "style"}
 REFERENCE = re.compile(r"url\(#([^)]+)\)")
 
 
 def element(tag: str, *children: str | Element, **attributes: str | None) -> Element:
-    """An element with text and elements in it.
+    """An element with texts and elements as children.
 
-    `aria_label="x"` and `class_="x"` are the attributes that they look like; None is none. Characters that are not to
-    be seen are shown as escapes, but for line breaks and tabs.
+    `aria_label="x"` is the attribute `aria-label`, `class_="x"` is `class`; an attribute that is None is left out.
+    Unprintable characters are shown as escapes, except line breaks and tabs.
     """
     made = Element(tag)
     for name, value in attributes.items():
@@ -38,25 +38,25 @@ def element(tag: str, *children: str | Element, **attributes: str | None) -> Ele
 
 
 def inline_svg(content: bytes, prefix: str, described_by: str) -> Element:
-    """One of matplotlib's SVG files as an element of a page.
+    """An SVG file of matplotlib as an element of a page.
 
-    Its ids get a prefix, for several figures share a page. Styles become attributes, which mean the same and which a
-    page without inline styles can show.
+    Ids get a prefix, because several figures share a page. Styles become attributes with the same meaning, because the
+    page forbids inline styles.
 
     Args:
-      prefix: of its ids, another one for each figure.
-      described_by: the id of the element that says what is to be seen.
+      prefix: of the ids, different for each figure.
+      described_by: the id of the element that describes the figure.
     """
-    # Comments hold the figure's texts, with characters that XML need not have.
+    # Comments repeat the figure's texts, which may contain characters that XML does not allow.
     root = ET.fromstring(re.sub(rb"<!--.*?-->", b"", content, flags=re.DOTALL))
     svg = _plain(root, prefix)
-    # What matplotlib's style sheet says of all elements.
+    # The rules of matplotlib's style sheet for all elements.
     svg.attrib |= {"stroke-linejoin": "round", "stroke-linecap": "butt", "role": "img", "aria-labelledby": described_by}
     return svg
 
 
 def _plain(node: Element, prefix: str) -> Element:
-    """Without namespaces, as HTML has it, and without styles."""
+    """The element without namespaces, as HTML expects it, and with attributes instead of styles."""
     attributes: dict[str, str] = {}
     for name, value in node.attrib.items():
         name = name.rpartition("}")[2]
@@ -75,11 +75,14 @@ def _plain(node: Element, prefix: str) -> Element:
 
 
 def document(title: str, style: str, script: str, *body: Element) -> str:
-    """A whole page, which can run and load nothing but what is given here.
+    """A complete page that can run and load only the given style and script.
 
     Args:
-      style: CSS.
-      script: JavaScript; it and the CSS are taken as they are.
+      style: CSS, inserted verbatim.
+      script: JavaScript, inserted verbatim.
+
+    Raises:
+      ValueError: the style or the script contains its own closing tag.
     """
     policy = {
         "default-src": "'none'",
@@ -95,7 +98,7 @@ def document(title: str, style: str, script: str, *body: Element) -> str:
         element("meta", http_equiv="Content-Security-Policy", content="; ".join(map(" ".join, policy.items()))),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="color-scheme", content="light dark"),
-        element("link", rel="icon", href="data:,"),  # else a server is asked for one
+        element("link", rel="icon", href="data:,"),  # otherwise browsers request one from a server
         element("title", title),
         _verbatim("style", style),
     )
@@ -105,12 +108,12 @@ def document(title: str, style: str, script: str, *body: Element) -> str:
 
 def _verbatim(tag: str, content: str) -> Element:
     if f"</{tag}" in content.lower():
-        raise ValueError(f"a {tag} that ends itself")
+        raise ValueError(f"the {tag} contains its closing tag")
     made = Element(tag)
     made.text = content
     return made
 
 
 def _hash(content: str) -> str:
-    """As a Content-Security-Policy names a style or a script."""
+    """The name of a style or a script in a Content-Security-Policy."""
     return f"sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}"

@@ -1,48 +1,74 @@
-"""The report as one page: what was run, tables, figures, details of each run, and what is not complete."""
+"""The report as one page: a summary, tables, figures, details of each run, and what is incomplete."""
 
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
 from matplotlib.figure import Figure
 
-from experiments.evidence import figures
-from experiments.evidence.cells import NOTHING, Cell, Table
+from experiments.evidence import figures, paper_tables, run_details, task_sizes
+from experiments.evidence.cells import NOTHING, Cell, ResultTable
 from experiments.evidence.markup import document, element, inline_svg
 from experiments.evidence.pooling import Collected
 from experiments.evidence.run_details import Command, Details
+from experiments.running import run_config
 
 FOLDER = Path(__file__).parent / "data" / "report"
-LONG = 45  # characters, from which on a cell may be wrapped
+LONG = 45  # cells with more characters may be wrapped
 # `4,275 ± 665 (5)`, `+12.0 % [3.0, 20.0]`, `P 0.67 [0.50, 0.90]`, `17 / 6`; not `0: 12.0  1: 13.0`.
 NUMBER = re.compile(r"(?:P )?([+-]?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?)(?![^\s,%])")
 
 
+ALL_COMPLETE = "Every score covers all planned steps and seeds."
+
+
 class Content(NamedTuple):
-    """All that a page is made of."""
+    """The contents of a page."""
 
     runs: Collected
-    tables: Sequence[Table]
-    figures: Mapping[str, Figure | None]  # None: there was nothing to draw
+    tables: Sequence[ResultTable]
+    figures: Mapping[str, Figure | None]  # None: nothing to draw
     details: Sequence[Details]
     made_at: datetime
     made_by: str  # the package and its version
     command: str
 
 
+def make_content(runs: Collected, reference: bool, statistic: str, command: str) -> Content:
+    """The contents of a page on `runs`, made now.
+
+    Args:
+      reference: with published numbers.
+      statistic: of the figures, `iqm` or `mean`.
+      command: the command line that is shown.
+
+    Raises:
+      UsageError: a run's config.json cannot be read or is damaged.
+    """
+    return Content(
+        runs=runs,
+        tables=paper_tables.make_tables(runs, reference, task_sizes.read_sizes(runs)),
+        figures={name: draw() for name, draw in figures.all_figures(runs, statistic).items()},
+        details=run_details.read_all(runs),
+        made_at=datetime.now(UTC),
+        made_by=f"sqt_jax {run_config.versions()['sqt_jax'] or 'of an unknown version'}",
+        command=command,
+    )
+
+
 def page(content: Content) -> str:
-    """HTML that needs no other file."""
+    """The report as HTML that needs no other file."""
     algos, tasks = _unique(run.algo for run in content.details), _unique(run.env for run in content.details)
     title = f"sqt_jax report: {_few(algos, 'algorithm')} on {_few(tasks, 'task')}"
     sections = {
         "Tables": [_table(table) for table in content.tables],
         "Figures": _figures(content.figures),
         "Runs": [_overview(content.details), *(_run(i, run) for i, run in enumerate(content.details, 1))],
-        "Not complete": [_incomplete(content)],
+        "Incomplete": [_incomplete(content)],
     }
     links = [element("li", element("a", name, href=f"#{_id(name)}")) for name in sections]
     header = element(
@@ -85,18 +111,18 @@ def _summary(content: Content) -> list[str | Element]:
         f"{trained:,}. How the runs ended: {_list(f'{n} {name}' for name, n in status.items())}."
     )
     if not _not_complete(content):
-        return [f"{text} Every score is of all that was planned."]
-    link = element("a", "what that is", href=f"#{_id('Not complete')}")
-    return [f"{text} ", element("strong", "Not everything is complete", class_="incomplete"), ": ", link, "."]
+        return [f"{text} {ALL_COMPLETE}"]
+    link = element("a", "what is missing", href=f"#{_id('Incomplete')}")
+    return [f"{text} ", element("strong", "Some runs are incomplete", class_="incomplete"), ": ", link, "."]
 
 
-def _table(table: Table) -> Element:
+def _table(table: ResultTable) -> Element:
     """A table with its caption and footnotes."""
     name = f"table-{table.name}"
     body = []
     for lines in table.sections:
         rows = [_row(line.cells, "published" if line.published else None, name) for line in lines]
-        # Percentages beneath scores are no scores, and are sorted by themselves.
+        # The comparisons below the scores of table 4 are sorted separately.
         apart = len(table.sections) > 1 and " against " in lines[0].cells[0].lines[0]
         body.append(element("tbody", *rows, class_="apart" if apart else None))
     notes = [element("li", note, id=f"{name}-note-{index}") for index, note in enumerate(table.notes, 1)]
@@ -115,7 +141,7 @@ def _sortable(header: Sequence[str], body: Sequence[Element]) -> Element:
 
 
 def _row(cells: Sequence[Cell], kind: str | None = None, name: str = "", link: str = "") -> Element:
-    """A row; its first cell is its header, with a `link` where there is one. `name`: of the table, for footnotes."""
+    """A row whose first cell is its header, optionally with a `link`. `name`: of the table, for links to footnotes."""
     made = []
     for index, cell in enumerate(cells):
         first = cell.lines[0] if index or not link else element("a", cell.lines[0], href=link)
@@ -136,12 +162,12 @@ def _figures(drawn: Mapping[str, Figure | None]) -> list[Element]:
     made = [_figure(index, figure) for index, figure in enumerate(found, 1)]
     missing = [name for name, figure in drawn.items() if not figure]
     if missing:
-        made.append(element("p", f"There was nothing to draw for {_list(missing)}.", class_="faint"))
+        made.append(element("p", f"Nothing to draw for {_list(missing)}.", class_="faint"))
     return made
 
 
 def _figure(index: int, figure: Figure) -> Element:
-    """A figure whose heading is its caption instead: that can be read aloud and searched, and wraps."""
+    """A figure with its heading as an HTML caption, which wraps and can be searched and read aloud."""
     name = f"figure-{index}"
     heading = " ".join(figure.get_suptitle().split())
     figure.suptitle("")
@@ -156,7 +182,7 @@ def _overview(details: Sequence[Details]) -> Element:
     for index, run in enumerate(details, 1):
         words = [str(index), run.algo, run.env, _list(map(str, run.seeds)), f"{run.steps:,}", run.physics, run.status]
         words += [run.facts.get("took", NOTHING), run.facts["began"]]
-        # Lists of seeds and dates begin with a digit and are no numbers.
+        # Lists of seeds and dates begin with a digit but are not numbers.
         rows.append(_row([Cell((word,)) for word in words], link=f"#run-{index}"))
         for place in (header.index("seeds"), header.index("began")):
             rows[-1][place].attrib.pop("data-sort", None)
@@ -182,18 +208,18 @@ def _run(index: int, run: Details) -> Element:
     def table(header: Sequence[str], rows: Sequence[Element]) -> Element:
         return _scrolled(_sortable(header, [element("tbody", *rows)]))
 
-    none = element("p", "None: all are the algorithm's defaults.", class_="faint")
+    none = element("p", "None.", class_="faint")
     return element(
         "details",
         element("summary", f"Run {index}: {run.algo} on {run.env}, {run.status}", id=name),
-        *part("To repeat it", *(piece for command in run.commands for piece in _command(command))),
-        *part("What it was", _pairs(pairs)),
+        *part("Commands that repeat it", *(piece for command in run.commands for piece in _command(command))),
+        *part("Overview", _pairs(pairs)),
         *part("Members", table(columns, members)),
         *part(
-            f"Settings that are not {run.algo}'s defaults",
+            f"Settings that differ from {run.algo}'s defaults",
             table(["setting", "here", "default"], settings) if settings else none,
         ),
-        *part("Versions it began with", _pairs(run.versions)),
+        *part("Versions at its start", _pairs(run.versions)),
         open="",
     )
 
@@ -207,12 +233,12 @@ def _command(command: Command) -> list[Element]:
 def _incomplete(content: Content) -> Element:
     lines = _not_complete(content)
     if not lines:
-        return element("p", "Nothing: every score is of all that was planned.")
+        return element("p", f"Nothing. {ALL_COMPLETE}")
     return element("ul", *(element("li", line) for line in lines))
 
 
 def _not_complete(content: Content) -> list[str]:
-    """What the footnotes of the scores say, a line per cell, and what was left out."""
+    """The footnotes of incomplete scores, a line per cell, and the runs that were left out."""
     records: list[dict[str, Any]] = [r for table in content.tables if table.name == "table2" for r in table.records]
     cells = [f"{r['row']} on {r['env']}: {r['notes']}" for r in records if r["notes"] and not r["source"]]
     return [*cells, *content.runs.notes]
@@ -225,7 +251,7 @@ def _pairs(pairs: Mapping[str, str]) -> Element:
 
 
 def _scrolled(child: Element) -> Element:
-    """What may be wider than the page."""
+    """A box that scrolls where its child is wider than the page."""
     return element("div", child, class_="scroll")
 
 

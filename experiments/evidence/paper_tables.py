@@ -1,10 +1,8 @@
-"""The paper's tables 1 to 4 of collected runs, as values; `experiments.evidence.formats` writes them.
+"""The paper's tables 1 to 4 of pooled runs, as values; `experiments.evidence.formats` writes them.
 
-A cell that is not all it should be carries the numbers of the footnotes that say why. No cell is filled from anywhere
-else than the runs it stands for.
+An incomplete cell has footnotes that say why, and an empty cell stays empty: its numbers come from its own runs only.
 """
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,29 +15,24 @@ from experiments.evidence.cells import (
     Cell,
     Line,
     Notes,
-    Table,
+    ResultTable,
     finite,
     interval,
     joined,
     number,
 )
-from experiments.evidence.comparisons import forms_compared, has_penalty, versus_base
-from experiments.evidence.pooling import (
-    PROTOCOL,
-    Collected,
-    Group,
-    Row,
-    base_algorithm,
-    row_differences,
-    setting_text,
-)
-from experiments.evidence.published import PAPERS_TASKS, Published
+from experiments.evidence.comparisons import against_baseline, variants_compared
+from experiments.evidence.groups import PROTOCOL, Group, setting_text
+from experiments.evidence.pooling import AlgorithmRow, Collected, row_differences
+from experiments.evidence.published import Published
+from experiments.evidence.task_sizes import table_1
+from experiments.evidence.variants import BATCH_STD, TRANSITION_STD, baseline_of
 
 NAMES = ("table1", "table2", "table2_improvement", "table3", "table3_change", "table4", "seeds")
 
 
 def spread(values: np.ndarray) -> dict[str, float | None]:
-    """Mean, population std and IQM of the seeds' values, and 95 % bootstrap intervals; one seed has no interval."""
+    """Mean, std (ddof 0) and IQM of `values` [seeds], with 95 % bootstrap intervals; one seed has no interval."""
     found: dict[str, float | None] = {"mean": float(values.mean()), "std": float(values.std())}
     found["iqm"] = float(statistics.iqm(values))
     for name, statistic in (("mean", statistics.mean), ("iqm", statistics.iqm)):
@@ -48,91 +41,70 @@ def spread(values: np.ndarray) -> dict[str, float | None]:
     return found
 
 
-def make_tables(collected: Collected, reference: bool = False, sizes: Sequence[dict[str, Any]] = ()) -> list[Table]:
-    """All tables that there is something for. `sizes`: what `task_sizes` gives."""
+def make_tables(
+    collected: Collected, reference: bool = False, sizes: Sequence[dict[str, Any]] = ()
+) -> list[ResultTable]:
+    """All tables that are not empty.
+
+    Args:
+      reference: also show published numbers.
+      sizes: of the tasks, for table 1 (`task_sizes.read_sizes`).
+    """
     tables = [table_1(sizes, reference), table_2(collected, reference)]
-    tables += [versus_base(collected, reference, "table2_improvement"), table_3(collected, reference)]
-    tables += [versus_base(collected, reference, "table3_change"), table_4(collected, reference)]
+    tables += [against_baseline(collected, reference, "table2_improvement"), table_3(collected, reference)]
+    tables += [against_baseline(collected, reference, "table3_change"), table_4(collected, reference)]
     tables += [seeds_table(collected)]
     return [table for table in tables if any(table.sections)]
 
 
-def task_sizes(collected: Collected) -> list[dict[str, Any]]:
-    """The sizes of the paper's tasks and the runs', from the environments themselves."""
-    return [dict(_sizes(name)) for name in dict.fromkeys([*PAPERS_TASKS, *collected.tasks])]
-
-
-@functools.cache
-def _sizes(name: str) -> Mapping[str, Any]:
-    from sqt_jax import envs  # brings JAX
-
-    env = envs.make(name, "mujoco" if "mujoco" in envs.physics_of(name) else None)
-    task = envs.TASKS[name].gymnasium_id if name in envs.TASKS else f"Brax {name.partition(':')[2]}"
-    sizes = {"observation": env.observation_size, "action": env.action_size, "episode_steps": env.episode_length}
-    return {"env": name, "task": task} | sizes
-
-
-def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> Table:
-    header = ["--env", "task", "observation", "action", "steps of an episode"]
-    theirs = published.paper()["table1_obs_action"] if reference else {}
-    lines, records = [], []
-    for row in sizes:
-        cells = [row["env"], row["task"], *(f"{row[name]:,}" for name in ("observation", "action", "episode_steps"))]
-        record = dict(row)
-        if reference:
-            of_paper = theirs.get(row["env"], ("", ""))
-            cells.append(" / ".join(map(str, of_paper)) if row["env"] in theirs else NOTHING)
-            record |= {"paper_observation": of_paper[0], "paper_action": of_paper[1]}
-        lines.append(Line([Cell((cell,)) for cell in cells]))
-        records.append(record)
-    header += [f"{published.PAPER}: observation / action"] if reference else []
-    return Table("table1", "Table 1: sizes of the tasks", header, [lines], "Read from the environments.", [], records)
-
-
-def table_2(collected: Collected, reference: bool) -> Table:
+def table_2(collected: Collected, reference: bool) -> ResultTable:
+    """Scores; `reference`: with published ones."""
     caption = (
-        "Score: the best evaluation of the mean over seeds, ± the population std over seeds there (number of seeds). "
-        f"Below: the IQM of the seeds at that evaluation and its 95 % bootstrap interval; {NOT_RESAMPLED}."
+        "Score: the best evaluation of the mean over seeds, ± the std over seeds at that evaluation (ddof 0, "
+        "population), and the number of seeds. Below: the IQM of the seeds at that evaluation and its 95 % bootstrap "
+        f"interval; {NOT_RESAMPLED}."
     )
     figures = published.scores() if reference else []
     table = ("table2", "Table 2: maximum average return", caption)
     return _algorithms(table, collected, collected.rows, _score_cell, "score", figures)
 
 
-def table_3(collected: Collected, reference: bool) -> Table:
+def table_3(collected: Collected, reference: bool) -> ResultTable:
+    """The critics' disagreement; `reference`: with the paper's."""
     caption = (
-        "std_T: q_std, the mean over the intervals between evaluations in which all seeds had updates, each interval "
-        "the same weight; ± the population std over seeds (number of seeds). Below: its IQM and 95 % bootstrap "
-        "interval. Bias: value_bias over the same evaluations, where it was measured."
+        "std_T: q_std, the std over critics with the penalty's ddof (setting ddof, 1 by default), averaged with equal "
+        "weights over the intervals between evaluations in which all seeds had updates; ± the std over seeds (ddof 0, "
+        "population), and the number of seeds. Below: its IQM and 95 % bootstrap interval. Bias: value_bias over the "
+        "same evaluations, where it was measured."
     )
     figures = published.q_stds() if reference else []
     table = ("table3", "Table 3: disagreement of the critics (std_T)", caption)
     return _algorithms(table, collected, collected.rows, _q_std_cell, "q_std", figures)
 
 
-def table_4(collected: Collected, reference: bool) -> Table:
-    """SQT and SQT-tuple, their scores and how they compare."""
-    both = [row for row in collected.rows if has_penalty(row)]
-    families = {base_algorithm(row.algo) for row in both if row.algo.endswith("_tuple")}
-    rows = [row for row in both if base_algorithm(row.algo) in families]
+def table_4(collected: Collected, reference: bool) -> ResultTable:
+    """Scores of SQT and SQT-tuple, and their comparisons; only for baselines with which SQT-tuple was run."""
+    both = [row for row in collected.rows if row.penalty in (BATCH_STD, TRANSITION_STD)]
+    baselines = {baseline_of(row.algo) for row in both if row.penalty == TRANSITION_STD}
+    rows = [row for row in both if baseline_of(row.algo) in baselines]
     caption = (
-        "Scores as in table 2. Comparisons: by how many per cent the first one's score exceeds the second one's, and "
-        "P, the probability that a seed of the first one exceeds one of the second, with 95 % bootstrap intervals; "
+        "Scores as in table 2. Comparisons: by how many per cent the first score exceeds the second, and P, the "
+        "probability that a seed of the first exceeds a seed of the second, with 95 % bootstrap intervals; "
         f"{NOT_RESAMPLED}."
     )
     figures = published.scores() if reference else []
     keep = {row.algo for row in rows}
-    figures = [figure for figure in figures if figure.algo in keep]  # not of their bases
-    title = "Table 4: the batch's mean std (sqt) and each transition's (sqt_tuple)"
+    figures = [figure for figure in figures if figure.algo in keep]  # not of their baselines
+    title = "Table 4: SQT (std averaged over the batch) against SQT-tuple (std of each transition)"
     table = _algorithms(("table4", title, caption), collected, rows, _score_cell, "score", figures)
     notes = Notes(table.notes)
-    lines, records = forms_compared(rows, collected, notes)
+    lines, records = variants_compared(rows, collected, notes)
     table.records.extend(records)
     return table._replace(sections=[*table.sections, lines] if lines else table.sections, notes=notes.texts)
 
 
-def seeds_table(collected: Collected) -> Table:
-    """What each seed reached."""
+def seeds_table(collected: Collected) -> ResultTable:
+    """The values of each seed."""
     notes = Notes()
     lines, records = [], []
     for row in collected.rows:
@@ -162,25 +134,32 @@ def seeds_table(collected: Collected) -> Table:
                     | {"value_bias": bias[index] if bias is not None else None, "run": str(member.run)}
                 )
     header = ["algorithm", "task", "return at the score's evaluation, by seed", "at the last one", "std_T"]
-    caption = "The values of each seed that the tables above are made of."
-    return Table("seeds", "Seeds", header, [lines], caption, notes.texts, records)
+    caption = "The seeds' values from which the tables above are computed."
+    return ResultTable("seeds", "Seeds", header, [lines], caption, notes.texts, records)
 
 
 def _algorithms(
     table: tuple[str, str, str],
     collected: Collected,
-    rows: Sequence[Row],
+    rows: Sequence[AlgorithmRow],
     cell_of: Callable[[Group], tuple[tuple[str, ...], dict[str, Any], list[str]]],
     quantity: str,
     figures: Sequence[Published],
-) -> Table:
-    """Algorithms × tasks, each algorithm's published figures beneath it."""
+) -> ResultTable:
+    """Algorithms × tasks, with published numbers below each algorithm.
+
+    Args:
+      table: name, title and caption.
+      cell_of: a group's lines of text, its numbers, and its footnotes in addition to the group's notes.
+      quantity: of the records.
+      figures: published numbers, of the baselines too.
+    """
     notes = Notes()
     most = max((len(group.seeds) for group in collected.groups), default=0)
     sections, records = [], []
     shown = dict.fromkeys(row.algo for row in rows)
-    if figures:  # of the bases too, in their place
-        shown = dict.fromkeys(name for algo in shown for name in (base_algorithm(algo), algo))
+    if figures:
+        shown = dict.fromkeys(name for algo in shown for name in (baseline_of(algo), algo))
     for algo in shown:
         lines = []
         for row in (row for row in rows if row.algo == algo):
@@ -188,7 +167,7 @@ def _algorithms(
             for task in collected.tasks:
                 group = row.groups.get(task)
                 if group is None:
-                    cells.append(Cell((NOTHING,), notes("no such run")))
+                    cells.append(Cell((NOTHING,), notes("not run")))
                     continue
                 text, numbers, why = cell_of(group)
                 why = [*group.notes, *why]
@@ -203,22 +182,22 @@ def _algorithms(
                 values = dict.fromkeys(group.settings[name] for group in row.groups.values())
                 cells.append(Cell((" / ".join(map(setting_text, values)),)))
             lines.append(Line(cells))
-        theirs = [figure for figure in figures if figure.algo == algo and figure.env in collected.tasks]
-        lines += _published_lines(theirs, collected.tasks, notes)
-        records += [_published_record(figure, quantity) for figure in theirs]
+        known = [figure for figure in figures if figure.algo == algo and figure.env in collected.tasks]
+        lines += _published_lines(known, collected.tasks, notes)
+        records += [_published_record(figure, quantity) for figure in known]
         if lines:
             sections.append(lines)
     name, title, caption = table
     header = ["algorithm", *collected.tasks, "penalty_coef", "steps", "UTD"]
     texts = [caption, *_protocol_notes(rows), *map(_sentence, collected.notes)]
     if figures and not any(line.published for lines in sections for line in lines):
-        texts.append("Nothing published is known for these algorithms and tasks.")
-    return Table(name, title, header, sections, " ".join(texts), notes.texts, records)
+        texts.append("No published numbers for these algorithms and tasks.")
+    return ResultTable(name, title, header, sections, " ".join(texts), notes.texts, records)
 
 
 def _score_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str]]:
     if group.score is None or group.scores is None:
-        return (NOTHING,), {}, ["no evaluation that all its seeds have"]
+        return (NOTHING,), {}, ["its seeds have no evaluation in common"]
     found = spread(group.scores)
     final = {f"final_{name}": value for name, value in spread(group.finals).items()}
     numbers = found | {"score_env_steps": group.scored_at, "per_seed": joined(group.scores)} | final
@@ -249,7 +228,7 @@ def _spread_lines(found: Mapping[str, float | None], seeds: int) -> tuple[str, .
 
 
 def _published_lines(figures: Sequence[Published], tasks: Sequence[str], notes: Notes) -> list[Line]:
-    """A line per source, its figures in the columns of their tasks."""
+    """A line per source, with its numbers in the columns of their tasks."""
     sources: dict[tuple[str, ...], dict[str, Published]] = {}
     for figure in figures:
         key = (figure.algo, figure.source, figure.env_version, figure.seeds, figure.updates_per_step)
@@ -277,14 +256,16 @@ def _published_record(figure: Published, quantity: str) -> dict[str, Any]:
     return where | numbers | source | {"notes": "; ".join(figure.notes)}
 
 
-def _record(row: Row, group: Group, quantity: str, numbers: Mapping[str, Any], why: Sequence[str]) -> dict[str, Any]:
+def _record(
+    row: AlgorithmRow, group: Group, quantity: str, numbers: Mapping[str, Any], why: Sequence[str]
+) -> dict[str, Any]:
     settings = {name: group.settings[name] for name in ("penalty_coef", *PROTOCOL)}
     where = {"algo": row.algo, "row": row.label, "env": group.env, "quantity": quantity}
     return where | dict(numbers) | {"seeds": joined(group.seeds)} | settings | {"source": "", "notes": "; ".join(why)}
 
 
-def _row_notes(row: Row) -> list[str]:
-    """What a row's tasks do not have in common; UTD and steps have columns of their own."""
+def _row_notes(row: AlgorithmRow) -> list[str]:
+    """The settings in which a row's tasks differ, except those with a column or in the caption."""
     found = []
     for name, values in row_differences(row).items():
         if name not in ("steps", "updates_per_step", *PROTOCOL):
@@ -293,8 +274,8 @@ def _row_notes(row: Row) -> list[str]:
     return found
 
 
-def _protocol_notes(rows: Sequence[Row]) -> list[str]:
-    """The protocol that all cells have in common, and who differs where they do not."""
+def _protocol_notes(rows: Sequence[AlgorithmRow]) -> list[str]:
+    """The protocol that all cells have in common, and the cells that differ from it."""
     groups = [(row, group) for row in rows for group in row.groups.values()]
     common, differing = [], []
     for name in PROTOCOL[2:]:
@@ -306,7 +287,7 @@ def _protocol_notes(rows: Sequence[Row]) -> list[str]:
         elif values:
             ranked = sorted(values.items(), key=lambda item: -len(item[1]))
             rest = "; ".join(f"{setting_text(value)} for {', '.join(where)}" for value, where in ranked[1:])
-            differing.append(f"Not everywhere the same: {name} is {setting_text(ranked[0][0])}, but {rest}.")
+            differing.append(f"Cells differ in {name}: it is {setting_text(ranked[0][0])}, but {rest}.")
     return ([f"Common to all: {', '.join(common)}."] if common else []) + differing
 
 

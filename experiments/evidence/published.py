@@ -1,4 +1,4 @@
-"""Published figures, to be shown beside ours and never as a pass mark; the data's own README says what they are."""
+"""Published numbers, shown next to ours for comparison, not as thresholds; sources: data/reference/README.md."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ PAPERS_TASKS = ("cheetah", "walker", "ant", "humanoid")
 PAPER = "SQT paper, text"
 RELEASED = "the authors' released curves of an earlier version (2023)"
 
-# Faults of the archive, by (algorithm, task).
+# Known faults of the released curves, by (algorithm, task).
 SHARED_FILE = "the archive's td3 seed-3 files of ant and humanoid are byte-identical"
 NEVER_LEARNS = (
     "td3 seed 2 of the archive never learns on humanoid (at most 360); the paper's 5.0K is the mean with it, 6.2K "
@@ -20,7 +20,7 @@ FAULTS = {("td3", "ant"): (SHARED_FILE,), ("td3", "humanoid"): (SHARED_FILE, NEV
 
 
 class Published(NamedTuple):
-    """One published figure."""
+    """One published number: a return or a std_T."""
 
     algo: str
     env: str
@@ -34,16 +34,25 @@ class Published(NamedTuple):
 
 
 def paper() -> dict[str, Any]:
-    """Every number that survives in the paper's text."""
+    """All numbers that the text of the paper has; its tables are images."""
     return json.loads((FOLDER / "paper_text.json").read_text())
 
 
 def scores() -> list[Published]:
-    """Returns at a million steps: other people's baselines, the released curves, the paper's text."""
+    """Returns at 1,000,000 steps: baselines of other publications, the authors' released curves, the paper's text."""
     with (FOLDER / "published_baselines.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     found = [
-        Published(row["algo"], env, float(row[env]), None, row["seeds"], row["env_version"], "", row["source"])
+        Published(
+            algo=row["algo"],
+            env=env,
+            value=float(row[env]),
+            std=None,
+            seeds=row["seeds"],
+            env_version=row["env_version"],
+            updates_per_step="",
+            source=row["source"],
+        )
         for row in rows
         for env in ("cheetah", "walker", "ant", "humanoid")
         if row[env]
@@ -51,8 +60,19 @@ def scores() -> list[Published]:
     released = json.loads((FOLDER / "released_2023_scores.json").read_text())
     for env, algos in released.items():
         for algo, entry in algos.items():
-            mean, std, seeds = entry["max_average"], entry["std_over_seeds_at_max"], str(len(entry["seeds"]))
-            found.append(Published(algo, env, mean, std, seeds, "Gym v2", "2", RELEASED, FAULTS.get((algo, env), ())))
+            found.append(
+                Published(
+                    algo=algo,
+                    env=env,
+                    value=entry["max_average"],
+                    std=entry["std_over_seeds_at_max"],
+                    seeds=str(len(entry["seeds"])),
+                    env_version="Gym v2",
+                    updates_per_step="2",
+                    source=RELEASED,
+                    notes=FAULTS.get((algo, env), ()),
+                )
+            )
     cells = paper()["table2_known_cells"]
     found += [_of_paper(algo, env, value) for env, values in cells.items() for algo, value in values.items()]
     cells = paper()["table4_known_cells"]["td3_sqt_tuple"]
@@ -60,7 +80,7 @@ def scores() -> list[Published]:
 
 
 def q_stds() -> list[Published]:
-    """The paper's std_T, where its text has numbers."""
+    """The paper's std_T, where its text has numbers; its ddof is not stated."""
     cells = paper()["table3_q_std"]
     return [_of_paper(algo, "humanoid", value) for algo, value in cells["humanoid"].items()]
 
@@ -68,4 +88,14 @@ def q_stds() -> list[Published]:
 def _of_paper(algo: str, env: str, value: float) -> Published:
     seeds = str(len(paper()["protocol"]["seeds"]))
     notes = (NEVER_LEARNS,) if (algo, env, value) == ("td3", "humanoid", 5000) else ()
-    return Published(algo, env, value, None, seeds, "version not stated", "", PAPER, notes)
+    return Published(
+        algo=algo,
+        env=env,
+        value=value,
+        std=None,
+        seeds=seeds,
+        env_version="version not stated",
+        updates_per_step="",
+        source=PAPER,
+        notes=notes,
+    )

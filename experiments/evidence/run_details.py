@@ -1,4 +1,4 @@
-"""What one run was, from the files it left: its settings, its versions, how it ended, the command that repeats it."""
+"""Details of one run, from its files: settings, versions, how it ended, and the command that repeats it."""
 
 import math
 import shlex
@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.commandline.arguments import UsageError
+from experiments.evidence import run_settings
 from experiments.evidence.cells import NOTHING, number
-from experiments.evidence.finished_runs import Curves
-from experiments.evidence.pooling import Collected, setting_text
-from experiments.running import files, run_config
-from sqt_jax.algorithms import make_config
+from experiments.evidence.finished_runs import MemberCurves
+from experiments.evidence.groups import OWN_PHYSICS, setting_text
+from experiments.evidence.pooling import Collected
+from experiments.evidence.run_settings import RunSettings
+from experiments.running import files
+from sqt_jax.algorithms import ALGORITHMS, make_config
 
 MAX_SUMMARY_BYTES = 10_000_000
 STATUSES = ("done", "interrupted", "diverged")
@@ -21,19 +23,23 @@ NOT_RECORDED = "not recorded in config.json"
 
 
 class Setting(NamedTuple):
+    """A setting that differs from the algorithm's default."""
+
     name: str
     value: str
     default: str
 
 
 class Command(NamedTuple):
-    text: str | None  # None: there is none in config.json
+    """A command line of the run: of its start, or of a continuation."""
+
+    text: str | None  # None: config.json has none
     label: str
     note: str = ""
 
 
-class Reached(NamedTuple):
-    """What one member reached, by its own rows of evaluations.csv."""
+class MemberReturns(NamedTuple):
+    """One member's final and best return, from its rows of evaluations.csv."""
 
     seed: int
     swept: tuple[str, ...]
@@ -44,6 +50,8 @@ class Reached(NamedTuple):
 
 
 class Details(NamedTuple):
+    """All that a page shows of one run."""
+
     path: Path
     algo: str
     env: str
@@ -54,51 +62,48 @@ class Details(NamedTuple):
     facts: dict[str, str]
     settings: list[Setting]  # those that are not the algorithm's defaults
     versions: dict[str, str]
-    commands: list[Command]  # in the order in which they were given
+    commands: list[Command]  # in order of time
     swept: list[str]
-    members: list[Reached]
+    members: list[MemberReturns]
 
 
 def read_all(collected: Collected) -> list[Details]:
-    """Of all runs that something is known of, in the order of the tables. Raises as `read`."""
-    curves: dict[Path, list[Curves]] = {}
+    """Details of all pooled runs, in the order of the tables. Raises as `read`."""
+    curves: dict[Path, list[MemberCurves]] = {}
     for group in collected.groups:
         for member in group.members:
             curves.setdefault(member.run, []).append(member)
     return [read(path, members) for path, members in curves.items()]
 
 
-def read(path: Path, curves: Sequence[Curves]) -> Details:
-    """The run in the folder `path`, whose members' tables are `curves`.
+def read(path: Path, curves: Sequence[MemberCurves]) -> Details:
+    """Details of the run in the folder `path` with the members `curves`.
 
     Raises:
-      UsageError: its config.json does not describe a run.
+      UsageError: config.json cannot be read or is damaged.
     """
-    try:
-        run = run_config.read(path)
-    except run_config.NotDescribed as error:
-        raise UsageError(f"{path}: {error}") from None
-    config, content = run.members[0].config, run.content
+    run = run_settings.read(path)
+    settings, content = run.members[0][1], run.content
     status, end = _end(path, bool(content["resumed"]))
     return Details(
-        path,
-        config.algo,
-        config.env,
-        tuple(dict.fromkeys(member.seed for member in run.members)),
-        config.train.steps,
-        config.physics,
-        status,
-        _facts(content) | end,
-        _changed(run),
-        {str(name): str(value) if value else "not installed" for name, value in content["versions"].items()},
-        _commands(content),
-        run.swept,
-        [_reached(member, run.swept) for member in curves],
+        path=path,
+        algo=settings["algo"],
+        env=settings["env"],
+        seeds=tuple(dict.fromkeys(seed for seed, _ in run.members)),
+        steps=settings["steps"],
+        physics=settings["physics"],
+        status=status,
+        facts=_facts(content) | end,
+        settings=_changed(run),
+        versions={str(name): str(value) if value else "not installed" for name, value in content["versions"].items()},
+        commands=_commands(content),
+        swept=run.swept,
+        members=[_returns(member, run.swept) for member in curves],
     )
 
 
 def _end(path: Path, resumed: bool) -> tuple[str, dict[str, str]]:
-    """How it ended, and what summary.json says besides: of all processes the time that it took, else of the last."""
+    """How the run ended, and times from summary.json: the wall time of all processes, the others of the last one."""
     try:
         summary = files.read_json(path / "summary.json", MAX_SUMMARY_BYTES)
         status = summary["status"]
@@ -111,7 +116,7 @@ def _end(path: Path, resumed: bool) -> tuple[str, dict[str, str]]:
     found = {}
     for key, name, unit in (
         ("wall_seconds", "took", "s"),
-        ("train_seconds", "training of the last process" if resumed else "of that training", "s"),
+        ("train_seconds", "training of the last process" if resumed else "training", "s"),
         ("steps_per_second", "speed of the last process" if resumed else "speed", "training steps/s"),
     ):
         value = summary.get(key)
@@ -131,13 +136,18 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
         "evaluated on": str(content.get("evaluated_on") or NOT_RECORDED),
         "preset": str(content["preset"]),
         "device": ", ".join([*dict.fromkeys(words), *cpus]) or NOT_RECORDED,
-        "commit": commit.replace("+changes", ", with changes that are in no commit"),
+        "commit": commit.replace("+changes", ", with uncommitted changes"),
     }
 
 
-def _changed(run: run_config.Described) -> list[Setting]:
-    config = run.members[0].config
-    own, default = run_config.settings_of(run.members, run.swept), make_config(config.algo, config.env).flat()
+def _changed(run: RunSettings) -> list[Setting]:
+    """The settings that differ from the algorithm's defaults; none for an unknown algorithm."""
+    settings = run.members[0][1]
+    if settings["algo"] not in ALGORITHMS:
+        return []
+    own = settings | {name: tuple(dict.fromkeys(member[name] for _, member in run.members)) for name in run.swept}
+    physics = {"physics": OWN_PHYSICS} if settings["physics"] == OWN_PHYSICS else {}  # else the task's default
+    default = make_config(settings["algo"], settings["env"], **physics).flat()
     return [
         Setting(name, setting_text(own[name]), setting_text(value))
         for name, value in default.items()
@@ -146,42 +156,42 @@ def _changed(run: run_config.Described) -> list[Setting]:
 
 
 def _commands(content: Mapping[str, Any]) -> list[Command]:
-    found = [_command(content, "It began with")]
+    found = [_command(content, "Started with")]
     versions = content["versions"]
     for entry in content["resumed"]:
         entry = entry if isinstance(entry, dict) else {}
         at = entry.get("env_steps")
         where = "" if type(at) is not int or at < 0 else f" at step {at:,}" if at else " from the start"
-        command = _command(entry, f"and was gone on with{where} by")
+        command = _command(entry, f"Resumed{where} with")
         own = entry.get("versions")
         other = {n: v for n, v in own.items() if v != versions.get(n)} if isinstance(own, dict) else {}
         if other:
             changed = ", ".join(f"{name} {value}" for name, value in other.items())
-            command = command._replace(note=f"{command.note} From there on with other versions: {changed}.".strip())
+            command = command._replace(note=f"{command.note} Other versions from there on: {changed}.".strip())
         found.append(command)
     return found
 
 
 def _command(entry: Mapping[str, Any], label: str) -> Command:
-    """A command line as a shell expects it. Its first word was the path of `experiments/run.py`."""
+    """A command line for a shell. Its first recorded word is the path of `experiments/run.py`."""
     words = entry.get("command")
     if not isinstance(words, list) or len(words) < 2 or not all(isinstance(word, str) for word in words):
-        return Command(None, label, "No command that could be repeated is recorded in config.json.")
+        return Command(None, label, "config.json has no command that can be repeated.")
     note = ""
     if any(word.lstrip("-").partition("=")[0] == "config" for word in words[1:]):
-        note = "It read flags from a file, which config.json does not hold; the settings that came of it are below."
+        note = "It read flags from a file that is not recorded; the resulting settings are below."
     return Command(shlex.join(["python", "-m", "experiments.run", *words[1:]]), label, note)
 
 
-def _reached(member: Curves, swept: Sequence[str]) -> Reached:
+def _returns(member: MemberCurves, swept: Sequence[str]) -> MemberReturns:
     returns, env_steps = member.columns["return_mean"], member.columns["env_steps"]
     best = int(np.nanargmax(returns)) if np.isfinite(returns).any() else None
     final = float(returns[-1])
-    return Reached(
-        member.seed,
-        tuple(setting_text(member.settings[name]) for name in swept),
-        f"{int(env_steps[-1]):,}",
-        f"{NOTHING} (diverged)" if math.isnan(final) else number(final),
-        NOTHING if best is None else number(float(returns[best])),
-        NOTHING if best is None else f"{int(env_steps[best]):,}",
+    return MemberReturns(
+        seed=member.seed,
+        swept=tuple(setting_text(member.settings[name]) for name in swept),
+        env_steps=f"{int(env_steps[-1]):,}",
+        final=f"{NOTHING} (diverged)" if math.isnan(final) else number(final),
+        best=NOTHING if best is None else number(float(returns[best])),
+        best_env_steps=NOTHING if best is None else f"{int(env_steps[best]):,}",
     )

@@ -1,6 +1,7 @@
-"""Statistics of a few runs: the paper's score, and those of Agarwal et al. 2021 (https://arxiv.org/abs/2108.13264).
+"""Statistics over few seeds: the paper's score, and those of Agarwal et al. 2021 (https://arxiv.org/abs/2108.13264).
 
-A stratum is the values of one algorithm on one task, `[..., seeds]`: seeds lie along the last axis.
+A stratum is the values of one algorithm on one task, [..., seeds]: seeds are the last axis. Stds have ddof 0
+(population).
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ class Score(NamedTuple):
 
     mean: float
     std: float  # population std over the seeds, at that evaluation
-    evaluation: int  # which one it is
+    evaluation: int  # its index
 
 
 class Interval(NamedTuple):
@@ -26,7 +27,7 @@ class Interval(NamedTuple):
 
 
 def score(returns: np.ndarray) -> Score | None:
-    """Score of `returns` [seeds, evaluations]; evaluations with a NaN do not count. None if there is no other."""
+    """Score of `returns` [seeds, evaluations]. Evaluations with a NaN do not count; None if none counts."""
     mean = returns.mean(axis=0)
     if not np.isfinite(mean).any():
         return None
@@ -35,14 +36,14 @@ def score(returns: np.ndarray) -> Score | None:
 
 
 def mean(*strata: np.ndarray) -> np.ndarray:
-    """Mean over strata of the mean over seeds: each task weighs the same, however many seeds it has."""
+    """Mean over strata of the mean over seeds, [...]: each task has the same weight, however many seeds it has."""
     return np.mean([stratum.mean(axis=-1) for stratum in strata], axis=0)
 
 
 def iqm(*strata: np.ndarray) -> np.ndarray:
-    """Interquartile mean of all values together: a quarter of them, rounded down, is left out at each end.
+    """Interquartile mean of all values together, [...]: a quarter of them, rounded down, is left out at each end.
 
-    NaN where there is a NaN among them, which would otherwise be left out as if it were large.
+    NaN where any value is NaN; sorting would otherwise treat it as the largest value and leave it out.
     """
     values = np.sort(np.concatenate(strata, axis=-1), axis=-1)
     count = values.shape[-1]
@@ -51,7 +52,11 @@ def iqm(*strata: np.ndarray) -> np.ndarray:
 
 
 def probability_of_improvement(*strata: np.ndarray) -> np.ndarray:
-    """P(X > Y) of `x, y` of a task, then of the next task, and so on: the mean over tasks. A tie counts one half."""
+    """P(X > Y), the mean over tasks, [...]. A tie counts one half.
+
+    Args:
+      strata: `x, y` of the first task, then of the next, [..., seeds] each.
+    """
     over_tasks = []
     for x, y in zip(strata[::2], strata[1::2], strict=True):
         x, y = x[..., :, None], y[..., None, :]
@@ -60,20 +65,28 @@ def probability_of_improvement(*strata: np.ndarray) -> np.ndarray:
 
 
 def improvement(*strata: np.ndarray) -> np.ndarray:
-    """By how many per cent the mean of X exceeds Y's, the mean over tasks; `x, y` of a task, then of the next.
+    """By how many per cent the mean of X exceeds that of Y, the mean over tasks, [...].
 
-    NaN where a mean of Y is not positive: a percentage of it would say nothing.
+    NaN where a mean of Y is not positive, because a percentage would be meaningless.
+
+    Args:
+      strata: `x, y` of the first task, then of the next, [..., seeds] each.
     """
     over_tasks = []
     for x, y in zip(strata[::2], strata[1::2], strict=True):
-        base = y.mean(axis=-1)
-        base = np.where(base > 0, base, np.nan)
-        over_tasks.append(100 * (x.mean(axis=-1) - base) / base)
+        other = y.mean(axis=-1)
+        other = np.where(other > 0, other, np.nan)
+        over_tasks.append(100 * (x.mean(axis=-1) - other) / other)
     return np.mean(over_tasks, axis=0)
 
 
 def exceeds(values: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """[thresholds, seeds]: 1.0 where a value lies above a threshold. Their `mean` is the performance profile."""
+    """1.0 where a value is above a threshold, [thresholds, seeds]. Their `mean` is the performance profile.
+
+    Args:
+      values: [seeds].
+      thresholds: [thresholds].
+    """
     return (values[None, :] > thresholds[:, None]).astype(float)
 
 
@@ -84,10 +97,10 @@ def bootstrap(
     confidence: float = CONFIDENCE,
     seed: int = 0,
 ) -> Interval:
-    """Percentile interval of `statistic(*strata)`: the seeds of each stratum are drawn anew with replacement.
+    """Percentile bootstrap interval of `statistic(*strata)`: the seeds of each stratum are resampled with replacement.
 
-    Strata are drawn independently of each other; what lies along their leading axes is drawn together. The same
-    `seed` gives the same interval. NaN where the statistic is NaN for some draw.
+    Strata are resampled independently; the leading axes of a stratum use the same draws. The same `seed` gives the same
+    interval. NaN where the statistic is NaN for a resample.
     """
     generator = np.random.default_rng(seed)
     drawn = []

@@ -35,8 +35,8 @@ def make_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
     """
     brax = is_brax(config.env)
     physics = physics or (config.physics if brax else "mujoco")
-    if physics not in envs.simulators(config.env):
-        raise UsageError(f"--physics={physics}: expects one of {', '.join(envs.simulators(config.env))}")
+    if physics not in envs.physics_of(config.env):
+        raise UsageError(f"--physics={physics}: expects one of {', '.join(envs.physics_of(config.env))}")
     if missing := envs.lacks(physics):
         raise UsageError(f"--physics={physics}: needs {missing}")
     if brax:

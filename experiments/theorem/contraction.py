@@ -1,11 +1,11 @@
-"""Is SQT's operator a gamma-contraction in the maximum norm, as eq. 16 has it?
+"""Is SQT's operator a gamma-contraction in the maximum norm, as eq. 16 states?
 
-An operator T gives one table [S, A] for N of them. With a deterministic next state, no reward and gamma taken out,
-(T Q)(s, a) is the value v(Q) that the rule gives to the N x A values of the next state. So the question is whether
+An operator T maps N tables to one table [S, A]. With a deterministic next state, no reward and gamma divided out,
+(T Q)(s, a) is the value v(Q) that the rule gives to the N x A values of the next state. The question is whether
 
     |v(Q) - v(Q')| <= max |Q - Q'|        for all Q and Q', [N, A]
 
-by how much it fails at most, and for which Q and Q'.
+and otherwise how large the ratio of the two sides can be, and for which Q and Q'.
 """
 
 import math
@@ -17,23 +17,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.theorem.q_learning import Rule, Target
+from experiments.theorem.q_learning import Rule, TabularAlgorithm, Target
 from sqt_jax.types import Array
 
 PAIRS = 100_000
+GAPS = (0.1, 0.01, 0.001)
 Values = Callable[[Array, Array], Array]  # many Q [P, N, A], coef [] -> [P]
 
 
-class Found(NamedTuple):
-    """The largest |v(Q) - v(Q')| / max |Q - Q'| of a search, and where."""
+class LargestRatio(NamedTuple):
+    """The largest |v(Q) - v(Q')| / max |Q - Q'| that a search found, and its pair."""
 
     ratio: float
-    one: np.ndarray  # Q [N, A]
-    other: np.ndarray  # Q' [N, A]
+    one: np.ndarray  # Q, [N, A]
+    other: np.ndarray  # Q', [N, A]
 
 
 def values_of(rule: Rule) -> Values:
-    """v of many Q at once, compiled once for all coefficients."""
+    """v for a batch of Q, compiled once for all coefficients."""
 
     def value(q: Array, coef: Array) -> Array:
         return rule(Target(jnp.zeros(()), jnp.ones(()), q, jnp.zeros((), jnp.int32), coef, 1.0))
@@ -49,11 +50,11 @@ def ratios(values: Values, coef: float, one: np.ndarray, other: np.ndarray) -> n
 
 def search(
     values: Values, coef: float, num_tables: int, num_actions: int, *, identical: bool = False, pairs: int = PAIRS
-) -> Found:
-    """Random pairs: Q normal, Q' - Q of one size in all entries with random signs, which is where v changes most.
+) -> LargestRatio:
+    """Searches random pairs: Q is normal; the entries of Q' - Q have one size and random signs, so that v changes most.
 
     Args:
-      identical: only tables that are all the same, in Q and in Q'.
+      identical: only pairs in which all tables of Q are equal, and all of Q' are.
     """
     generator = np.random.default_rng(0)
     tables = 1 if identical else num_tables
@@ -64,22 +65,22 @@ def search(
     one, other = (np.repeat(q, num_tables // tables, axis=1).astype(np.float32) for q in (one, other))
     found = ratios(values, coef, one, other)
     best = int(found.argmax())
-    return Found(float(found[best]), one[best], other[best])
+    return LargestRatio(float(found[best]), one[best], other[best])
 
 
 def bound(coef: float, num_tables: int, ddof: int) -> float:
-    """The largest ratio where the next action is given, by hand: 1 + coef * 2 sqrt(k (N - k) / (N (N - ddof))).
+    """The largest ratio with a given next action, derived by hand: 1 + coef * 2 sqrt(k (N - k) / (N (N - ddof))).
 
-    The sum of the absolute partial derivatives of min - coef * std is 1 + coef * sum_i |Q_i - mean| / ((N - ddof) std),
-    and the sum of deviations is largest beside their squares where k = floor(N / 2) tables agree on a low value and the
-    rest on a high one: the low ones fall and the high ones rise together.
+    The sum of the absolute partial derivatives of min - coef * std is 1 + coef * sum_i |Q_i - mean| / ((N - ddof) std).
+    Relative to the squared deviations, the sum of deviations is largest where k = floor(N / 2) tables agree on a low
+    value and the others on a high one: the low ones fall and the high ones rise together.
     """
     low = num_tables // 2
     return 1 + coef * 2 * math.sqrt(low * (num_tables - low) / (num_tables * (num_tables - ddof)))
 
 
 def exact_value(q: Sequence[Fraction], coef: Fraction, ddof: int) -> Fraction:
-    """min - coef * std without rounding.
+    """min - coef * std in exact arithmetic, for one action; `q` [N].
 
     Raises:
       ValueError: the std is not rational.
@@ -104,11 +105,38 @@ def counter_example(coef: Fraction) -> tuple[Fraction, Fraction]:
 
 
 def near_tie(values: Values, coef: float, gap: float) -> float:
-    """|v(Q) - v(Q')| / max |Q - Q'| where two next actions change places in the choice.
+    """|v(Q) - v(Q')| / max |Q - Q'| where the chosen next action changes between Q and Q'.
 
-    Two tables agree on 0 for the first action. For the second, the better one by `gap`, they say x and x + 2: x is
-    `gap` where the choice is by the minimum, `gap` - 1 where it is by the mean. In Q' it is the worse one by `gap`.
+    Both tables give 0 to the first action and x and x + 2 to the second, which is better by `gap` in Q and worse by
+    `gap` in Q': x is `gap` where the choice is by the minimum, `gap` - 1 where it is by the mean.
     """
     one = np.array([[[0.0, x], [0.0, x + 2.0]] for x in (gap, gap - 1)], np.float32)
     other = one - np.array([0.0, 2 * gap], np.float32)
     return float(ratios(values, coef, one, other).max())
+
+
+class Expansion(NamedTuple):
+    """Largest |T Q - T Q'| / (gamma max |Q - Q'|) for one coefficient."""
+
+    coef: float
+    given: float  # found with a given next action
+    bound: float  # the most that this can be, derived by hand
+    choice: float  # found with a choice of four next actions
+    alike: float  # found with a choice of four, all tables identical
+    ties: tuple[float, ...]  # two next actions, each of `GAPS` from a tie
+
+
+def expansions(algorithm: TabularAlgorithm, coefs: Sequence[float], ddof: int, pairs: int) -> list[Expansion]:
+    """The largest ratios for each coefficient, in searches over `pairs` random pairs each."""
+    values, count = values_of(algorithm.rule), algorithm.num_tables
+    return [
+        Expansion(
+            coef=coef,
+            given=search(values, coef, count, 1, pairs=pairs).ratio,
+            bound=bound(coef, count, ddof),
+            choice=search(values, coef, count, 4, pairs=pairs).ratio,
+            alike=search(values, coef, count, 4, identical=True, pairs=pairs).ratio,
+            ties=tuple(near_tie(values, coef, gap) for gap in GAPS),
+        )
+        for coef in coefs
+    ]

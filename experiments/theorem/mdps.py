@@ -1,6 +1,6 @@
-"""Small Markov decision processes whose optimal values are known, for the tabular experiments.
+"""Small Markov decision processes with known optimal values, for the tabular study.
 
-NumPy, float64: they are built once and handed to JAX as arrays. `S` is here the number of states, `A` of actions.
+NumPy, float64: they are built once and passed to JAX as arrays. `S` is the number of states, `A` of actions.
 """
 
 from collections.abc import Callable
@@ -10,10 +10,10 @@ import numpy as np
 
 
 class Mdp(NamedTuple):
-    """A finite MDP with Gaussian rewards. Stacked along a leading axis, several of one shape are an Mdp too.
+    """A finite MDP with Gaussian rewards. Several of one shape, stacked along a leading axis, are an `Mdp` too.
 
-    There are no terminal states: what the probabilities of a row lack to 1 is the probability that the episode ends
-    there. The next one begins at `start`.
+    There are no terminal states: the episode ends with probability 1 minus the sum of a transition's row, and the next
+    one begins at `start`.
     """
 
     transition: np.ndarray  # [S, A, S], rows sum to at most 1
@@ -24,13 +24,13 @@ class Mdp(NamedTuple):
 
 def random_mdp(
     seed: int,
-    states: int = 15,  # as many as the grid has: its programs are compiled already
+    states: int = 15,  # as many as the grid has, so that both share their programs
     actions: int = 4,
     concentration: float = 0.5,
     spread: float = 0.3,
     noise: float = 1.0,
 ) -> Mdp:
-    """Dirichlet transitions, normal means of the rewards, no end; another one for each seed."""
+    """Dirichlet transitions, normally distributed mean rewards, no end of an episode; differs between seeds."""
     generator = np.random.default_rng(seed)
     transition = generator.dirichlet(np.full(states, concentration), (states, actions))
     reward = generator.normal(scale=spread, size=(states, actions))
@@ -40,9 +40,9 @@ def random_mdp(
 def bias_chain(seed: int = 0, links: int = 3, actions: int = 8, mean: float = -0.1, noise: float = 1.0) -> Mdp:
     """A chain on which a maximum over noisy values is too high, after Sutton and Barto's example 6.7.
 
-    In state 0 the first half of the actions ends the episode and the others go on to state 1, all without reward. In
-    the states after it, `links` of them (1 in the book), every action is rewarded by N(mean, noise) and goes on, the
-    last one's to the end. Leaving at once is best where `mean` is negative.
+    In state 0 half of the actions end the episode and the others lead to state 1, all without reward. `links` states
+    follow (1 in the book); in each, every action has reward N(mean, noise) and leads to the next state, and from the
+    last state to the end. Where `mean` is negative, ending at once is best.
     """
     del seed
     transition = np.zeros((links + 1, actions, links + 1))
@@ -57,11 +57,11 @@ def bias_chain(seed: int = 0, links: int = 3, actions: int = 8, mean: float = -0
 def grid_world(seed: int = 0, size: int = 4, slip: float = 0.2, step: float = -0.1, noise: float = 1.0) -> Mdp:
     """From one corner of a square to the opposite one, where the episode ends with a reward of 1.
 
-    Four actions; with probability `slip` the direction is one of the four at random; a wall holds. Every other step is
-    rewarded by N(step, noise).
+    Four actions; with probability `slip` the direction is random; walls block. All other steps have reward
+    N(step, noise).
     """
     del seed
-    states, goal = size * size - 1, size * size - 1  # the goal is no state: there the episode is over
+    states, goal = size * size - 1, size * size - 1  # the goal is not a state, because the episode ends there
     transition = np.zeros((states, 4, states))
     reward, spread = np.full((states, 4), step), np.full((states, 4), noise)
     moves = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -81,7 +81,7 @@ def grid_world(seed: int = 0, size: int = 4, slip: float = 0.2, step: float = -0
 MDPS: dict[str, Callable[[int], Mdp]] = {"random": random_mdp, "chain": bias_chain, "grid": grid_world}
 TITLES = {"random": "random MDPs", "chain": "maximisation-bias chain", "grid": "stochastic grid"}
 ABOUT = {
-    "random": "random: another one per seed, 15 states, 4 actions, Dirichlet(0.5) transitions, rewards N(m, 1), "
+    "random": "random: a different one per seed, 15 states, 4 actions, Dirichlet(0.5) transitions, rewards N(m, 1), "
     "m from N(0, 0.3^2) and a constant added that makes Q* 0 on average",
     "chain": "chain: 3 links after the choice to leave, 8 actions, rewards N(-0.1, 1)",
     "grid": "grid: 4 x 4, slip 0.2, steps N(-0.1, 1), goal +1",
@@ -89,11 +89,12 @@ ABOUT = {
 
 
 def stack(mdps: list[Mdp]) -> Mdp:
+    """MDPs of one shape as one `Mdp`, leaves [len(mdps), ...]."""
     return Mdp(*(np.stack(leaves) for leaves in zip(*mdps, strict=True)))
 
 
 def backup(mdp: Mdp, value: np.ndarray, gamma: float) -> np.ndarray:
-    """What an action gives if a state's worth is `value [S]`: [S, A]."""
+    """The value of each action if `value [S]` is the value of the states: [S, A]."""
     return mdp.reward + gamma * mdp.transition @ value
 
 
@@ -111,15 +112,15 @@ def optimal_q(mdp: Mdp, gamma: float, tolerance: float = 1e-12) -> np.ndarray:
         better = backup(mdp, q.max(axis=1), gamma)
         change, before = np.abs(better - q).max(), change
         q = better
-        # A contraction is within gamma / (1 - gamma) of its fixed point's distance of a step.
+        # The distance to the fixed point is at most gamma / (1 - gamma) times the last change.
         if change * gamma <= tolerance * (1 - gamma) or (change < 1e-9 * (1 + np.abs(q).max()) and change >= before):
             return q
 
 
 def centred(mdp: Mdp, gamma: float) -> Mdp:
-    """The same with a constant added to all rewards, so that Q* is 0 on average; episodes that end are left alone.
+    """The MDP with a constant added to all rewards so that the mean of Q* is 0; unchanged where episodes end.
 
-    Tables that begin with zeros are then neither too high nor too low on average.
+    Tables that are initialised with zeros then begin without a bias.
     """
     if mdp.transition.sum(axis=-1).min() < 1 - 1e-9:
         return mdp

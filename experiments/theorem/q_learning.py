@@ -1,10 +1,11 @@
-"""Tabular Q-learning and what was built on it, one row of a table per algorithm.
+"""Tabular Q-learning and the algorithms built on it, as a table of algorithms.
 
-An algorithm keeps `N` tables of values [S, A], and differs by the target of a transition (s, a, r, s') and by which
-tables learn from it. The step size of a pair is 1 / n^power, n the visits after which its table has learned: for powers
-above 1/2 and up to 1 their sum diverges and that of their squares does not (Robbins and Monro's conditions).
+An algorithm has `N` tables of values [S, A]. Algorithms differ in the target of a transition (s, a, r, s') and in which
+tables learn from it. The step size of a pair is 1 / n^power, where n counts the visits from which its table has
+learned. For powers above 1/2 and up to 1 the sum of step sizes diverges and that of their squares converges (Robbins
+and Monro's conditions).
 
-Taken from where (U and V are the two tables, U the one that learns, chosen by a fair coin each step):
+Sources (U and V are the two tables; U learns, chosen by a fair coin each step):
 
 - `q_learning`: Watkins, 1989. r + gamma * max_a Q(s', a).
 - `double_q`: van Hasselt, 2010. r + gamma * V(s', a*) with a* = argmax_a U(s', a).
@@ -15,13 +16,13 @@ Taken from where (U and V are the two tables, U the one that learns, chosen by a
 - `sqt`: the SQT paper's eq. 13. r + gamma * (min_i Q_i(s', a') - coef * std_i Q_i(s', a')).
 - `sqt_shared`: the same target, and all tables learn from each transition, as the critics of a deep SQT agent do.
 
-Assumed for `sqt`, since the formula as it was at hand does not say:
+Assumed for `sqt`, because the text of the paper does not say:
 
-- a' is greedy with respect to the minimum over the tables, so that coef 0 is MaxMin exactly; `greedy` has the mean and
-  the penalised value as others;
+- a' is greedy with respect to the minimum over the tables, so that coef 0 is exactly MaxMin; `greedy` offers the mean
+  and the penalised value instead;
 - one table at random learns from each transition, as in MaxMin;
 - the std has `ddof` 1, as everywhere in this repository;
-- the penalty is inside gamma, and there is none where the episode ended. A "batch" is one transition here, so that
+- the penalty is multiplied by gamma, and is 0 where the episode ended. A "batch" is one transition here, so that
   eqs. 19 and 20 agree.
 
 Behaviour is uniform, or epsilon-greedy on the mean of the tables.
@@ -43,7 +44,7 @@ GREEDY = ("min", "mean", "penalised")
 
 
 class Target(NamedTuple):
-    """What a target is made of: one transition, and the values that all tables give to the next state."""
+    """The inputs of a target: one transition, and the values of the next state in all tables."""
 
     reward: Array  # []
     discount: Array  # [], 0 where the episode ended, else 1
@@ -56,7 +57,9 @@ class Target(NamedTuple):
 Rule = Callable[[Target], Array]
 
 
-class Algorithm(NamedTuple):
+class TabularAlgorithm(NamedTuple):
+    """A row of the table of algorithms."""
+
     rule: Rule
     num_tables: int
     all_learn: bool = False  # from each transition; else one table at random
@@ -64,15 +67,18 @@ class Algorithm(NamedTuple):
 
 
 def single(t: Target) -> Array:
+    """Q-learning's target, []."""
     return t.reward + t.gamma * t.discount * jnp.max(t.next_q[t.learner])
 
 
 def double(t: Target) -> Array:
+    """Double Q-learning's target, []."""
     best = jnp.argmax(t.next_q[t.learner])
     return t.reward + t.gamma * t.discount * t.next_q[1 - t.learner, best]
 
 
 def weighted_double(t: Target, *, c: float) -> Array:
+    """Weighted Double Q-learning's target, []; eqs. 1 and 2."""
     u, v = t.next_q[t.learner], t.next_q[1 - t.learner]
     best, lowest = jnp.argmax(u), jnp.argmin(u)
     spread = jnp.abs(v[best] - v[lowest])
@@ -87,10 +93,12 @@ def _of_all(t: Target, score: Array, penalty: q_targets.Penalty) -> Array:
 
 
 def maxmin(t: Target) -> Array:
+    """MaxMin's target, []."""
     return _of_all(t, q_targets.min_over_critics(t.next_q), q_targets.no_penalty)
 
 
 def sqt(t: Target, *, ddof: int, greedy: str) -> Array:
+    """SQT's target, []; eq. 13."""
     penalty = functools.partial(q_targets.transition_std, coef=t.coef, ddof=ddof)
     lowest = q_targets.min_over_critics(t.next_q)
     score = {
@@ -101,23 +109,23 @@ def sqt(t: Target, *, ddof: int, greedy: str) -> Array:
     return _of_all(t, score, penalty)
 
 
-def algorithms(num_tables: int = 4, ddof: int = 1, greedy: str = "min", c: float = 1.0) -> dict[str, Algorithm]:
-    """The table of algorithms, by name.
+def algorithms(num_tables: int = 4, ddof: int = 1, greedy: str = "min", c: float = 1.0) -> dict[str, TabularAlgorithm]:
+    """The algorithms by name.
 
     Args:
       num_tables: N of MaxMin and SQT.
       ddof: the std over tables divides by N - ddof.
-      greedy: by what SQT's next action is chosen, one of `GREEDY`.
+      greedy: the value whose maximum is SQT's next action, one of `GREEDY`.
       c: Weighted Double Q-learning's constant; 0 is Q-learning's target on U, infinity Double Q-learning's.
     """
     penalised = functools.partial(sqt, ddof=ddof, greedy=greedy)
     return {
-        "q_learning": Algorithm(single, 1),
-        "double_q": Algorithm(double, 2),
-        "weighted_double_q": Algorithm(functools.partial(weighted_double, c=c), 2),
-        "maxmin": Algorithm(maxmin, num_tables),
-        "sqt": Algorithm(penalised, num_tables, has_coef=True),
-        "sqt_shared": Algorithm(penalised, num_tables, all_learn=True, has_coef=True),
+        "q_learning": TabularAlgorithm(single, 1),
+        "double_q": TabularAlgorithm(double, 2),
+        "weighted_double_q": TabularAlgorithm(functools.partial(weighted_double, c=c), 2),
+        "maxmin": TabularAlgorithm(maxmin, num_tables),
+        "sqt": TabularAlgorithm(penalised, num_tables, has_coef=True),
+        "sqt_shared": TabularAlgorithm(penalised, num_tables, all_learn=True, has_coef=True),
     }
 
 
@@ -137,7 +145,7 @@ def model_of(mdp: Mdp, optimal: np.ndarray) -> Model:
 
     def cumulative(probabilities: np.ndarray) -> np.ndarray:
         total = np.cumsum(probabilities, axis=-1)
-        return np.where(total > 1 - 1e-12, 1.0, total)  # a row that sums to 1 but for rounding never ends an episode
+        return np.where(total > 1 - 1e-12, 1.0, total)  # a row that sums to 1 up to rounding never ends an episode
 
     arrays = (mdp.transition, cumulative(mdp.transition), mdp.reward, mdp.noise, cumulative(mdp.start), optimal)
     return Model(*(jnp.asarray(array, jnp.float32) for array in arrays))
@@ -161,9 +169,16 @@ class Transition(NamedTuple):
 
 
 def learn(
-    learner: Learner, seen: Transition, chosen: Array, coef: Array, *, algorithm: Algorithm, gamma: float, power: float
+    learner: Learner,
+    seen: Transition,
+    chosen: Array,
+    coef: Array,
+    *,
+    algorithm: TabularAlgorithm,
+    gamma: float,
+    power: float,
 ) -> Learner:
-    """One update; `chosen []` is the table that learns, where not all do."""
+    """One update. `chosen []` is the table that learns, for algorithms in which not all do."""
     target = algorithm.rule(Target(seen.reward, seen.discount, learner.tables[:, seen.next_state], chosen, coef, gamma))
     learns = jnp.ones(algorithm.num_tables) if algorithm.all_learn else jnp.arange(algorithm.num_tables) == chosen
     learns = learns.astype(jnp.float32)
@@ -177,7 +192,7 @@ def learn(
 
 
 def act(model: Model, learner: Learner, key: Array, epsilon: float) -> tuple[Transition, Array]:
-    """One step in the MDP, and the state in which the next one begins."""
+    """One step in the MDP: the transition, and the state of the next step, which is a start state after an end."""
     uniform_key, normal_key = jax.random.split(key)
     explore, action, where, restart = jax.random.uniform(uniform_key, (4,))
     noise = jax.random.normal(normal_key)
@@ -195,17 +210,17 @@ def act(model: Model, learner: Learner, key: Array, epsilon: float) -> tuple[Tra
     return Transition(*at, reward, there, 1.0 - ended.astype(jnp.float32)), begin
 
 
-class Record(NamedTuple):
-    """What is measured of the tables at a checkpoint; of N tables, means and maxima are over all of them."""
+class Measurements(NamedTuple):
+    """Measurements of the tables after some step, []; means and maxima are over all N tables."""
 
     error_max: Array  # max |Q_i - Q*|
     error_mean: Array  # mean |Q_i - Q*|
     bias: Array  # mean (Q_i - Q*)
-    std: Array  # mean over pairs of std_i Q_i; 0 for a single table
-    ratio: Array  # max |T Q - Q*| / (gamma * max |Q_i - Q*|), T the algorithm's expected target; eq. 16 wants <= 1
+    std: Array  # mean over pairs (s, a) of std_i Q_i with the penalty's ddof; 0 for a single table
+    ratio: Array  # max |T Q - Q*| / (gamma * max |Q_i - Q*|), T the algorithm's expected target; at most 1 by eq. 16
 
 
-def expected_target(model: Model, tables: Array, coef: Array, algorithm: Algorithm, gamma: float) -> Array:
+def expected_target(model: Model, tables: Array, coef: Array, algorithm: TabularAlgorithm, gamma: float) -> Array:
     """The algorithm's operator T on its tables, [N, S, A] -> [L, S, A], for each of L tables that may be learning."""
 
     def value(next_q: Array, learner: Array) -> Array:
@@ -216,12 +231,15 @@ def expected_target(model: Model, tables: Array, coef: Array, algorithm: Algorit
     return model.reward + gamma * jnp.einsum("sat,lt->lsa", model.transition, values)
 
 
-def measure(model: Model, tables: Array, coef: Array, *, algorithm: Algorithm, gamma: float, ddof: int) -> Record:
+def measure(
+    model: Model, tables: Array, coef: Array, *, algorithm: TabularAlgorithm, gamma: float, ddof: int
+) -> Measurements:
+    """Measures `tables` [N, S, A] against the model's optimal values."""
     error = tables - model.optimal
     largest = jnp.max(jnp.abs(error))
     after = jnp.max(jnp.abs(expected_target(model, tables, coef, algorithm, gamma) - model.optimal))
     several = len(tables) > 1
-    return Record(
+    return Measurements(
         error_max=largest,
         error_mean=jnp.mean(jnp.abs(error)),
         bias=jnp.mean(error),
@@ -236,16 +254,19 @@ def train(
     coef: Array,
     lengths: Array,
     *,
-    algorithm: Algorithm,
+    algorithm: TabularAlgorithm,
     gamma: float = 0.9,
     power: float = 0.8,
     epsilon: float = 1.0,
     ddof: int = 1,
     init_std: float = 0.0,
-) -> tuple[Learner, Record]:
-    """Learns from one stream of experience; measures after each of `lengths [C]` further steps.
+) -> tuple[Learner, Measurements]:
+    """Learns from one stream of experience and measures after each of `lengths [C]` further steps.
 
-    The draws of the MDP depend on the key alone: with uniform behaviour all algorithms see the same stream.
+    The MDP's random numbers depend on the key only: with uniform behaviour all algorithms see the same stream.
+
+    Returns:
+      the learner, and measurements [C].
     """
     num_states, num_actions = model.reward.shape
     shape = (algorithm.num_tables, num_states, num_actions)
@@ -260,17 +281,17 @@ def train(
         learner = learn(learner, seen, chosen, coef, algorithm=algorithm, gamma=gamma, power=power)
         return learner._replace(state=begin, steps=learner.steps + 1)
 
-    def stretch(learner: Learner, length: Array) -> tuple[Learner, Record]:
+    def stretch(learner: Learner, length: Array) -> tuple[Learner, Measurements]:
         learner = jax.lax.fori_loop(0, length, step, learner)
         return learner, measure(model, learner.tables, coef, algorithm=algorithm, gamma=gamma, ddof=ddof)
 
     return jax.lax.scan(stretch, first, lengths)
 
 
-def sweep(model: Model, seeds: Array, coefs: Array, lengths: Array, **settings) -> tuple[Learner, Record]:
-    """All seeds and coefficients in one program: leaves [seeds, coefs, ...]. `model` has a leading axis of seeds."""
+def sweep(model: Model, seeds: Array, coefs: Array, lengths: Array, **settings) -> tuple[Learner, Measurements]:
+    """`train` for all seeds and coefficients in one program: leaves [seeds, coefs, ...]; the model's [seeds, ...]."""
 
-    def one(model: Model, key: Array, coef: Array) -> tuple[Learner, Record]:
+    def one(model: Model, key: Array, coef: Array) -> tuple[Learner, Measurements]:
         return train(model, key, coef, lengths, **settings)
 
     over_coefs = jax.vmap(one, in_axes=(None, None, 0))

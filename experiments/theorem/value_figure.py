@@ -1,4 +1,4 @@
-"""The figure of the tabular experiment: errors, bias and std over the steps."""
+"""The figure of the tabular study: errors, bias and std over the steps."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +13,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from experiments.evidence.figure_style import COLOURS
 from experiments.theorem import mdps
-from experiments.theorem.claims import Curves, Names, collapsed, interval
+from experiments.theorem.learning_curves import LearningCurves, Names, collapsed, interval
 
 STYLES = {  # colour, line, label
     "q_learning": (COLOURS[0], "-", "Q-learning"),
@@ -27,15 +27,15 @@ QUANTITIES = {"error_max": "max |Q − Q*|", "bias": "bias, mean (Q − Q*)", "s
 
 
 def _shade(colour: str, share: float) -> tuple[float, float, float]:
-    """From half white to the colour itself to a darker one."""
+    """`share` from 0 to 1: from half white over the colour itself to a darker one."""
     red, green, blue = to_rgb(colour)
     if share < 0.5:
         return tuple(1 - (1 - c) * (0.45 + 1.1 * share) for c in (red, green, blue))  # type: ignore[return-value]
     return tuple(c * (1 - 0.8 * (share - 0.5)) for c in (red, green, blue))  # type: ignore[return-value]
 
 
-def draw(results: Mapping[Names, Curves], file: Path | BinaryIO) -> None:
-    """A PNG: a panel per MDP and quantity over the steps, means and 95 % intervals over seeds."""
+def draw(results: Mapping[Names, LearningCurves], file: Path | BinaryIO) -> None:
+    """Writes a PNG with a panel per MDP and quantity: means over seeds and their 95 % intervals over the steps."""
     names = list(dict.fromkeys(mdp for mdp, _ in results))
     figure = Figure(figsize=(4.2 * len(names) + 0.6, 9.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
@@ -46,7 +46,7 @@ def draw(results: Mapping[Names, Curves], file: Path | BinaryIO) -> None:
             for (where, algo), curves in results.items():
                 if where == mdp:
                     _draw(axes, algo, curves, quantity)
-            _dress(axes, quantity)
+            _style_axes(axes, quantity)
             if column == 0:
                 axes.set_ylabel(label)
         panels[0, column].set_title(mdps.TITLES[mdp], fontsize="medium")
@@ -62,17 +62,17 @@ def draw(results: Mapping[Names, Curves], file: Path | BinaryIO) -> None:
     figure.savefig(file)
 
 
-def _label(algo: str, curves: Curves, index: int) -> str:
+def _label(algo: str, curves: LearningCurves, index: int) -> str:
     coef, label = curves.coefs[index], STYLES[algo][2]
     return label if coef is None or algo == "sqt_shared" and collapsed(curves) else f"{label}, coef {coef:g}"
 
 
-def _draw(axes: Axes, algo: str, curves: Curves, quantity: str) -> None:
+def _draw(axes: Axes, algo: str, curves: LearningCurves, quantity: str) -> None:
     colour, line, _ = STYLES[algo]
     values = getattr(curves.record, quantity)
     if quantity == "std" and not values.any():
-        return  # no tables to differ, or none that do
-    # Coefficients of one that does not depend on them would lie on top of each other.
+        return  # a single table, or tables that are equal
+    # Only SQT depends on its coefficients; other algorithms' curves would cover each other.
     shown = range(len(curves.coefs)) if algo == "sqt" else [len(curves.coefs) - 1]
     for k in shown:
         name = _label(algo, curves, k)
@@ -82,13 +82,13 @@ def _draw(axes: Axes, algo: str, curves: Curves, quantity: str) -> None:
         axes.plot(curves.steps, mean, line, color=tint, linewidth=1.6, label=name)
 
 
-def _dress(axes: Axes, quantity: str) -> None:
+def _style_axes(axes: Axes, quantity: str) -> None:
     axes.set_xscale("log")
     if quantity == "bias":
         axes.axhline(0, color="0.3", linewidth=0.8)
     elif axes.lines:
         axes.set_yscale("log")
-        # A band may reach 0 or below it, which this axis does not have: the lines say where it ends.
+        # A band may reach 0 or less, which a logarithmic axis cannot show: the lines limit the axis.
         heights = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
         heights = heights[np.isfinite(heights) & (heights > 0)]
         if heights.size:
