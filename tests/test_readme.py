@@ -12,7 +12,7 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench, play, plots, report, run, tables
-from experiments.commandline import flags
+from experiments.commandline import flag_table, flags
 from experiments.running.plan import make_plan
 
 ROOT = Path(__file__).parent.parent
@@ -137,6 +137,36 @@ def test_commands_that_measure_are_valid(argv, monkeypatch):
     with flagsaver.flagsaver():
         assert bench.FLAGS(argv) == argv[:1]  # nothing is left over
         bench.check_flags()
+
+
+def test_a_file_of_settings_is_valid(tmp_path):
+    (code,) = (code for kind, _, code in BLOCKS["experiments/README.md"] if kind == "yaml")
+    (tmp_path / "settings.yaml").write_text(code)
+    options = flags.parse(["run", f"--config={tmp_path / 'settings.yaml'}", "--seeds=0,1"])
+    assert len(options.sweep["penalty_coef"]) == 3 and options.settings["steps"] == 300_000
+
+
+def words_in_code(title):
+    """The words in backticks of a section of experiments/README.md, up to the next heading of its level."""
+    level = title.split()[0]
+    section = re.search(
+        rf"^{title}\n(.*?)^#{{2,{len(level)}}} ", TEXT["experiments/README.md"], re.DOTALL | re.MULTILINE
+    )
+    return set(re.findall(r"`([^`\s]+)`", section.group(1)))
+
+
+def test_the_flags_of_the_guide_exist():
+    known = set(re.findall(r"^  (--\w+)", flag_table.help_text(), re.MULTILINE))
+    shown = {
+        word.replace("--nopenalty", "--penalty") for word in words_in_code("## run") if re.fullmatch(r"--\w+", word)
+    }
+    assert len(shown) > 30 and shown <= known
+
+
+def test_every_column_is_in_the_guide():
+    shown = words_in_code("### Columns")
+    for path in (ROOT / RESULTS).glob("*/*.csv"):
+        assert set(path.read_text().split("\n")[0].split(",")) <= shown, path
 
 
 @functools.cache
