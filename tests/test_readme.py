@@ -213,7 +213,7 @@ def test_a_policy_of_a_run_loads_as_shown(tmp_path):
 
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory):
-    """A copy of the source with the penalty and the setting that sqt_jax/README.md adds."""
+    """A copy of the source with the penalty, the reduction and the setting of sqt_jax/README.md."""
     folder = tmp_path_factory.mktemp("extended")
     for package in ("sqt_jax", "experiments"):
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("results", "__pycache__"))
@@ -225,6 +225,7 @@ def extended(tmp_path_factory):
         path.write_text(text)
 
     insert("q_targets.py", r"^PENALTIES\b.*\{\n", marked("penalties"), after=f"{marked('penalty')}\n\n")
+    insert("q_targets.py", r"^REDUCTIONS\b.*\{\n", marked("reductions"))
     insert("algorithms.py", r"^ALGORITHMS\b.*\{\n", marked("algorithms"))
     insert("config.py", r"^class AgentConfig\b.*:\n(    \"\"\"(.|\n)*?\"\"\"\n)?", marked("setting"))
     return folder
@@ -236,7 +237,7 @@ def python_in(folder, code):
     return done.stdout
 
 
-def test_a_penalty_is_added_as_shown(extended):
+def test_a_penalty_and_a_reduction_are_added_as_shown(extended):
     code = """
 import jax, jax.numpy as jnp, sqt_jax
 agents = {name: sqt_jax.make_agent(name, 3, 2, hidden=(8,)) for name in ("td3", "td3_range")}
@@ -249,6 +250,8 @@ for agent in agents.values():
 assert (errors[0] != errors[1]).all()
 assert sqt_jax.ALGORITHMS["td3_range"].baseline == "td3"
 assert sqt_jax.make_config("td3_range", "ant").agent.penalty_coef == 0.5
+median = sqt_jax.make_agent("td3", 3, 2, hidden=(8,), ensemble_size=3, reduce="median")
+assert median.update(median.init(jax.random.key(1)), batch, keys[4], 0)[1].shape == (4,)
 """
     python_in(extended, code)
 
@@ -285,6 +288,15 @@ def test_links_lead_somewhere(page):
         path = (ROOT / page).parent / file if file else ROOT / page
         assert path.exists(), target
         assert not anchor or anchor in anchors(path.read_text()), target
+
+
+@pytest.mark.parametrize("page", TEXT)
+def test_files_and_tests_named_exist(page):
+    folders = [ROOT, ROOT / "sqt_jax", ROOT / "experiments", (ROOT / page).parent]
+    for name, _, test in re.findall(r"`(?:pytest )?([\w/]+\.py)(::(\w+))?", TEXT[page]):
+        paths = [folder / name for folder in folders if (folder / name).is_file()]
+        assert paths, name
+        assert not test or f"def {test}(" in paths[0].read_text(), test
 
 
 def test_the_first_page_is_short():
