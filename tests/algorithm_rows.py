@@ -4,7 +4,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.algorithms import ALGORITHMS, default_agent_config, features_of
+from sqt_jax.config import SETTINGS
 
 
 def first_rows(kind):
@@ -16,6 +17,11 @@ def first_rows(kind):
 
 
 KINDS = first_rows(lambda row: (row.build, row.settings.get("penalty")))
+
+
+def has_effect(algo, setting) -> bool:
+    """Whether a setting does anything with an algorithm's own settings."""
+    return set(SETTINGS[setting].features) <= features_of(ALGORITHMS[algo], default_agent_config(algo))
 
 
 ONE_OF_EACH = ("td3", "sac_sqt", "td7_sqt_tuple")  # each agent and each penalty

@@ -1,5 +1,7 @@
 """The table of algorithms: its names, its rows, and that the functions of a name are those of its row."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -7,19 +9,22 @@ from probe_envs import constant_reward
 
 from sqt_jax import lap
 from sqt_jax.agents import sac, td3, td7
+from sqt_jax.agents.policy_checkpoints import CheckpointedState
 from sqt_jax.algorithms import (
-    AGENT_SETTINGS,
     ALGORITHMS,
-    TRAIN_SETTINGS,
+    BASELINES,
     agent_of,
+    default_agent_config,
     make_agent,
     make_config,
+    make_parts,
     make_train,
     make_trainer,
     replay_of,
 )
-from sqt_jax.config import ConfigError
+from sqt_jax.config import FEATURES, SETTINGS, AgentConfig, TrainConfig
 from sqt_jax.ring import RingState
+from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Transition
 
 VARIANTS = {"": ("none", 0.0), "_sqt": ("batch_std", 0.5), "_sqt_tuple": ("transition_std", 0.1)}
@@ -28,12 +33,12 @@ EARLIER = {"maxmin": td3, "redq": sac}  # with and without _sqt
 NAMES = {base + suffix: module for base, module in PAPERS_NINE.items() for suffix in VARIANTS} | {
     base + suffix: module for base, module in EARLIER.items() for suffix in ("", "_sqt")
 }
-STATES = {td3: td3.TD3State, sac: sac.SACState, td7: td7.TD7State}
+STATES = {td3: td3.TD3State, sac: sac.SACState, td7: CheckpointedState}
 TD7 = [name for name, module in NAMES.items() if module is td7]
 
 
 def base_of(algo):
-    return algo.split("_sqt")[0]
+    return ALGORITHMS[algo].baseline or algo
 
 
 def test_the_table_has_these_names():
@@ -48,11 +53,11 @@ def test_each_name_is_its_bases_agent_with_its_variants_penalty(algo):
     assert (agent.penalty, agent.penalty_coef) == VARIANTS[algo.removeprefix(base_of(algo))]
 
 
-@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if "_sqt" in name])
+@pytest.mark.parametrize("algo", [name for name, row in ALGORITHMS.items() if row.baseline])
 def test_a_variant_differs_from_its_base_by_the_penalty_alone(algo):
     ours, plain = make_config(algo, "ant").flat(), make_config(base_of(algo), "ant").flat()
     assert {name for name in ours if ours[name] != plain[name]} == {"algo", "penalty", "penalty_coef"}
-    fields = ("make_agent", "training", "ignores", "assessed")
+    fields = ("build", "build_released", "features", "training", "follows")
     row, base_row = ALGORITHMS[algo], ALGORITHMS[base_of(algo)]
     assert all(getattr(row, field) == getattr(base_row, field) for field in fields)
 
@@ -61,7 +66,7 @@ def test_a_variant_differs_from_its_base_by_the_penalty_alone(algo):
     ("algo", "base", "differences"),
     [
         ("maxmin", "td3", {"ensemble_size": 4}),
-        ("redq", "sac", {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5}),
+        ("redq", "sac", {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5, "policy_delay": 5}),
     ],
 )
 def test_the_earlier_ensembles_are_settings_of_td3_and_sac(algo, base, differences):
@@ -75,14 +80,18 @@ def test_sale_networks_make_the_same_actions_in_td7s_update_without_its_checkpoi
     settings = {"networks": "sale", "hidden": (5, 4), "embedding_size": 6}
     agent = make_agent(algo, 3, 2, **settings)
     state = jax.eval_shape(agent.init, jax.random.key(0))
-    assert isinstance(state, td7.TD7State) and state.checkpoints is None
+    assert isinstance(state, td7.TD7State)
     assert ("log_std" in state.actor["params"]) == (NAMES[algo] is sac)
     batch = Transition(*(jnp.zeros(shape) for shape in ((4, 3), (4, 2), (4,), (4, 3), (4,))))
-    noise, plain_noise = (
-        jax.eval_shape(make_agent(algo, 3, 2, **changes).draw_noise, jax.random.key(0), batch)
+    draws, plain_draws = (
+        jax.eval_shape(
+            make_parts(algo, dataclasses.replace(default_agent_config(algo), **changes), 3, 2).draw,
+            jax.random.key(0),
+            batch,
+        )
         for changes in (settings, {})
     )
-    assert noise == plain_noise
+    assert draws == plain_draws
 
 
 @pytest.mark.parametrize("algo", TD7)
@@ -94,9 +103,15 @@ def test_td7_has_its_own_networks(algo):
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_rows_name_settings_that_exist(algo):
-    assert set(ALGORITHMS[algo].settings) <= AGENT_SETTINGS
-    assert set(ALGORITHMS[algo].training) <= TRAIN_SETTINGS
-    assert ALGORITHMS[algo].ignores <= AGENT_SETTINGS - set(ALGORITHMS[algo].settings)
+    row = ALGORITHMS[algo]
+    assert set(row.settings) | set(row.follows) <= set(settings_of(AgentConfig))
+    assert set(row.training) | set(row.follows.values()) <= set(settings_of(TrainConfig))
+    assert row.features <= set(FEATURES)
+    assert row.baseline is None or row.baseline in BASELINES
+
+
+def test_every_feature_is_some_algorithms_and_some_settings():
+    assert {feature for about in SETTINGS.values() for feature in about.features} == set(FEATURES)
 
 
 def test_settings_override_the_row():
@@ -133,7 +148,11 @@ def test_an_environment_of_ones_own_gives_the_sizes(algo):
     env = constant_reward()
     config = make_config(algo, "ant", hidden=(5,), ensemble_size=3, replay_capacity=300)
     agent = jax.eval_shape(agent_of(config, env).init, jax.random.key(0))
-    assert jax.tree.leaves(agent.critic)[1].shape == (3, env.observation_size + env.action_size, 5)
+    assert jax.tree.leaves(getattr(agent, "learner", agent).critic)[1].shape == (
+        3,
+        env.observation_size + env.action_size,
+        5,
+    )
     state = jax.eval_shape(make_trainer(config, env).init, jax.random.key(0))
     assert jax.tree.structure(state.agent) == jax.tree.structure(agent)
     storage = (state.replay.rows if algo in TD7 else state.replay).storage
@@ -147,7 +166,7 @@ def test_every_row_makes_a_whole_run(algo):
     config = make_config(algo, "ant", hidden=(5, 4), steps=1000, warmup_steps=300, eval_every=500, eval_episodes=2)
     state, history = jax.eval_shape(jax.vmap(make_train(config, env)), jax.random.split(jax.random.key(0), 3))
     assert history.returns.shape == (3, 3, 2)
-    assert state.agent.gradient_steps.shape == (3,)
+    assert state.gradient_steps.shape == (3,)
     needed = {"critic_loss", "actor_loss", "q_mean", "q_std", "penalty", "td_target", "td_error", "train_return"}
     own = {td3: set(), sac: {"temperature", "entropy"}, td7: {"encoder_loss", "assessments", "checkpoint_refreshes"}}
     assert needed | own[NAMES[algo]] <= set(history.metrics)

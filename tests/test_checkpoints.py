@@ -28,7 +28,7 @@ class Case:
     """A small sweep, and states of it."""
 
     def __init__(self, algo="td3_sqt", devices=1, make_env=probe_envs.one_step, **settings):
-        small = {"embedding_size": 16} if ALGORITHMS[algo].assessed else {}
+        small = {"embedding_size": 16} if "checkpoints" in ALGORITHMS[algo].features else {}
         self.config, trainer, self.sweep = make(algo, make_env, replay_capacity=CAPACITY, **small, **settings)
         self.replay = replay_of(self.config, make_env())
         self.template = jax.eval_shape(lambda: start(self.config, self.sweep))

@@ -3,10 +3,13 @@
 import json
 import pickle
 
+import probe_envs
 import pytest
+from algorithm_rows import has_effect
 
 from sqt_jax.algorithms import ALGORITHMS, make_config
-from sqt_jax.config import CHOICES, LIMITS, SWITCHES, AgentConfig, ConfigError, TrainConfig
+from sqt_jax.config import FEATURES, SETTINGS, AgentConfig, TrainConfig
+from sqt_jax.settings import ConfigError
 from sqt_jax.types import Scalars
 
 
@@ -20,11 +23,12 @@ def test_defaults_are_the_papers_protocol(algo):
     assert (agent.lr, agent.gamma, agent.hidden) == (3e-4, 0.99, (256, 256))
     assert (agent.ddof, agent.penalty_inside_gamma, agent.actor_reduce) == (1, True, "mean")
     assert agent.tau == 0.005
-    ensemble = {"maxmin": (4, "min", 1), "redq": (10, "subset_min", 5)}.get(algo.split("_sqt")[0], (2, "min", 1))
+    baseline = ALGORITHMS[algo].baseline or algo
+    ensemble = {"maxmin": (4, "min", 1), "redq": (10, "subset_min", 5)}.get(baseline, (2, "min", 1))
     assert (agent.ensemble_size, agent.reduce, train.updates_per_step) == ensemble
 
 
-@pytest.mark.parametrize(("algo", "policy_delay"), [("td3", 2), ("sac", 1), ("td7", 2), ("maxmin", 2), ("redq", 1)])
+@pytest.mark.parametrize(("algo", "policy_delay"), [("td3", 2), ("sac", 1), ("td7", 2), ("maxmin", 2), ("redq", 5)])
 def test_defaults_of_the_noises_the_temperature_and_the_delay(algo, policy_delay):
     agent = make_config(algo, "ant").agent
     assert agent.policy_delay == policy_delay
@@ -39,9 +43,9 @@ def test_defaults_of_td7_are_its_papers():
     assert (agent.checkpoint_switch, agent.assessment_episodes, agent.checkpoint_reset_weight) == (750_000, 20, 0.9)
 
 
-def taker(settings):
+def user(settings):
     """An algorithm on which these settings have an effect."""
-    return next(algo for algo in ("sac_sqt", "td7_sqt") if not ALGORITHMS[algo].ignores & settings.keys())
+    return next(a for a in ("sac_sqt", "td7_sqt", "redq_sqt", "sac") if all(has_effect(a, name) for name in settings))
 
 
 REFUSED = [
@@ -63,10 +67,9 @@ REFUSED = [
     ("ensemble_size", {"ensemble_size": 1, "ddof": 0}),
     ("ensemble_size", {"ensemble_size": 1001}),
     ("subset_size", {"subset_size": 0}),
-    ("subset_size", {"reduce": "subset_min", "subset_size": 3}),
+    ("subset_size", {"subset_size": 11}),
     ("networks", {"networks": "cnn"}),
     ("sampled_actor", {"sampled_actor": 1}),
-    ("squashed_log_prob", {"squashed_log_prob": "no"}),
     ("train_encoder", {"train_encoder": 0}),
     ("value_clipping", {"value_clipping": None}),
     ("hidden", {"hidden": ()}),
@@ -99,7 +102,7 @@ REFUSED = [
     ("steps", {"steps": 2**31}),
     ("physics", {"physics": "bullet"}),
     ("penalty_inside_gamma", {"penalty_inside_gamma": "no"}),
-    ("learn_temperature", {"learn_temperature": "no"}),
+    ("temperature", {"learn_temperature": "no"}),
     ("hidden", {"hidden": 256}),
     ("hidden", {"hidden": (True,)}),
     ("warmup_steps", {"warmup_steps": -1}),
@@ -122,14 +125,24 @@ REFUSED = [
 @pytest.mark.parametrize(("setting", "settings"), REFUSED, ids=str)
 def test_what_cannot_be_is_refused_by_its_name(setting, settings):
     with pytest.raises(ConfigError) as error:
-        make_config(taker(settings), "ant", **settings)
+        make_config(user(settings), "ant", **settings)
     assert error.value.setting == setting
     message = str(error.value)
     assert message.startswith((f"--{setting}: expects ", f"--{setting}: expected ")) and "\n" not in message
 
 
 def test_every_limited_setting_is_among_the_refused():
-    assert set(LIMITS) | set(CHOICES) | set(SWITCHES) <= {setting for setting, _ in REFUSED}
+    assert set(SETTINGS) - {"eval_physics", "squashed_log_prob"} <= {
+        name for _, settings in REFUSED for name in settings
+    }
+
+
+def test_every_setting_says_what_it_is_and_expects():
+    for name, about in SETTINGS.items():
+        assert about.help and about.expects(), name
+        assert set(about.features) <= set(FEATURES), name
+        if about.default is not None:
+            about.check(about.default)
 
 
 @pytest.mark.parametrize(
@@ -146,12 +159,12 @@ def test_every_limited_setting_is_among_the_refused():
     ids=str,
 )
 def test_the_edges_of_the_limits_are_taken(settings):
-    flat = make_config(taker(settings), "ant", **settings).flat()
+    flat = make_config(user(settings), "ant", **settings).flat()
     assert {name: flat[name] for name in settings} == settings
 
 
 def test_a_plain_algorithm_takes_no_penalty():
-    with pytest.raises(ConfigError, match="--penalty_coef: expects 0 for td3, .* _sqt and _sqt_tuple"):
+    with pytest.raises(ConfigError, match="--penalty_coef: has no effect with td3$"):
         make_config("td3", "ant", penalty_coef=0.5)
     assert make_config("td3", "ant", penalty_coef=0).agent.penalty_coef == 0
 
@@ -171,8 +184,8 @@ def test_a_plain_algorithm_may_have_one_critic():
         ("td3", {"temperature": 0.1}),
         ("td3_sqt", {"priority_exponent": 0.5}),
         ("sac", {"exploration_noise": 0.2}),
-        ("sac_sqt", {"sampled_actor": True}),
-        ("td3", {"squashed_log_prob": False}),
+        ("maxmin", {"checkpoint_switch": 5}),
+        ("sac", {"penalty_inside_gamma": False}),
         ("td7", {"tau": 0.01}),
         ("td7_sqt", {"temperature": 0.1}),
     ],
@@ -190,6 +203,7 @@ def test_a_setting_without_effect_is_refused_and_its_default_is_taken(algo, sett
         ("mlp", {"target_update_period": 100}),
         ("mlp", {"min_priority": 2.0}),
         ("mlp", {"train_encoder": False}),
+        ("mlp", {"squashed_log_prob": False}),
         ("sale", {"tau": 0.01}),
     ],
 )
@@ -197,6 +211,29 @@ def test_a_setting_without_effect_on_these_networks_is_refused(networks, setting
     (name,) = settings
     with pytest.raises(ConfigError, match=f"--{name}: has no effect with --networks={networks}$"):
         make_config("sac_sqt", "ant", networks=networks, **settings)
+
+
+def test_a_switch_of_the_released_code_expects_true_or_false():
+    with pytest.raises(ConfigError, match="--squashed_log_prob: expects true or false, not 'no'$"):
+        make_config("sac", "ant", networks="sale", squashed_log_prob="no")
+
+
+def test_redqs_actor_is_updated_once_per_environment_step():
+    """Unless its delay is given: https://arxiv.org/abs/2101.05982, algorithm 1."""
+    assert make_config("redq_sqt", "ant", updates_per_step=20).agent.policy_delay == 20
+    assert make_config("redq", "ant", updates_per_step=20, policy_delay=1).agent.policy_delay == 1
+    assert make_config("sac", "ant", updates_per_step=20).agent.policy_delay == 1
+
+
+def test_an_environment_of_ones_own_is_recorded_under_its_name():
+    env = probe_envs.one_step()
+    config = make_config("td3", env)
+    assert (config.env, config.physics, config.eval_physics) == (env.name, "own", "own")
+    assert make_config(**config.flat()) == config  # read back without the environment
+    with pytest.raises(ConfigError, match="--physics: has no effect with an environment of your own$"):
+        make_config("td3", env, physics="mjx")
+    with pytest.raises(ConfigError, match="--env: expects one of cheetah"):
+        make_config("td3", env.name)
 
 
 def test_the_temperature_is_fixed_with_sale_networks():

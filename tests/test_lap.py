@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sqt_jax import lap
-from sqt_jax.members import member_axes
 from sqt_jax.ring import Ring
 from sqt_jax.types import Transition
 
@@ -335,7 +334,7 @@ MEMBERS = 3
 def training_loop(capacity):
     """Insert, sample and feedback of a sweep's members in a loop, compiled as in the training program."""
     buffer = lap.lap(Ring(capacity, O, A, min_mean_episode_length=8), 64)
-    axes = member_axes(jax.eval_shape(buffer.init))
+    axes = buffer.member_axes
     insert = jax.vmap(buffer.insert, in_axes=(axes, 0), out_axes=axes)
     sample = jax.vmap(buffer.sample, in_axes=(axes, 0))
     feedback = jax.vmap(buffer.feedback, in_axes=(axes, 0, 0, None), out_axes=axes)

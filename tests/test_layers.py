@@ -12,16 +12,9 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS = [
     {"sqt_jax.types", "sqt_jax.suggestions"},
     {"sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
-    {
-        "sqt_jax.config",
-        "sqt_jax.q_targets",
-        "sqt_jax.networks",
-        "sqt_jax.losses",
-        "sqt_jax.bias",
-        "sqt_jax.optimizers",
-        "sqt_jax.ring",
-    },
-    {"sqt_jax.replay", "sqt_jax.lap", "sqt_jax.sale"},  # on top of ring and networks
+    {"sqt_jax.settings", "sqt_jax.q_targets", "sqt_jax.networks", "sqt_jax.bias", "sqt_jax.optimizers", "sqt_jax.ring"},
+    {"sqt_jax.config", "sqt_jax.replay", "sqt_jax.lap", "sqt_jax.gaussian"},
+    {"sqt_jax.sale"},
     {"sqt_jax.agents", "sqt_jax.envs"},
     {"sqt_jax.rollout"},
     {"sqt_jax.evaluate"},
@@ -58,7 +51,7 @@ PACKAGES = (
 LOWER = {"experiments.running.files", "experiments.running.csv_rows", "experiments.evidence.statistics"}
 # Beyond the order of the layers.
 REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
-NETWORKS = ("sqt_jax.networks", "sqt_jax.sale", "sqt_jax.losses", "sqt_jax.q_targets")
+NETWORKS = ("sqt_jax.networks", "sqt_jax.gaussian", "sqt_jax.sale", "sqt_jax.q_targets")
 NEVER = {
     "sqt_jax.agents": ("sqt_jax.envs", *REPLAYS),
     "sqt_jax.envs": ("sqt_jax.agents", *REPLAYS, *NETWORKS),
@@ -70,14 +63,14 @@ NEVER = {
     "sqt_jax.rollout": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
     "sqt_jax.evaluate": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
 }
-# What an agent may take from others: TD7 is TD3's successor and smooths its target as TD3 does.
+# What an agent may import from others: TD7 is TD3's successor, and the released code varies all three.
 AGENTS = {
-    "actions": (),
-    "assessment": (),
     "critic": (),
-    "td3": ("actions", "critic"),
-    "sac": ("actions", "critic"),
-    "td7": ("actions", "assessment", "critic", "td3"),
+    "policy_checkpoints": (),
+    "td3": ("critic",),
+    "sac": ("critic",),
+    "td7": ("critic", "policy_checkpoints", "td3"),
+    "released": ("policy_checkpoints", "td3", "sac", "td7"),
 }
 
 

@@ -1,5 +1,3 @@
-from typing import NamedTuple
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,10 +7,6 @@ from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation
 from sqt_jax.rollout import Episodes
 from sqt_jax.train import Sweep, TrainState
-
-
-class FakeAgent(NamedTuple):
-    gradient_steps: jnp.ndarray  # []
 
 
 class Recorder:
@@ -32,8 +26,8 @@ class Recorder:
         self.now += steps / 100
         broken = self.breaks_at is not None and self.done >= self.breaks_at
         return state._replace(
-            agent=FakeAgent(state.agent.gradient_steps + steps * learn),
             env_steps=jnp.int32(self.done),
+            gradient_steps=state.gradient_steps + steps * learn,
             diverged_at=np.array([-1, self.breaks_at if broken else -1]),
             means=state.means + steps * learn,
         )
@@ -49,11 +43,18 @@ class Recorder:
 
     def run(self, stop=lambda: False, **options):
         self.saved = []
-        agent = FakeAgent(jnp.zeros((), jnp.int32))
         at = options.get("start", Position()).env_steps
         self.done = at
         state = TrainState(
-            agent, None, Episodes.start(1), None, None, jnp.int32(at), np.full(2, -1), means=jnp.zeros(2)
+            agent=None,
+            timestep=None,
+            episodes=Episodes.start(1),
+            replay=None,
+            key=None,
+            env_steps=jnp.int32(at),
+            gradient_steps=jnp.zeros((), jnp.int32),
+            diverged_at=np.full(2, -1),
+            means=jnp.zeros(2),
         )
         return train_loop(
             self.sweep,

@@ -83,7 +83,7 @@ def test_members_train_on_two_devices_as_on_one(both):
     for a, b in zip(numbers(one), numbers(two), strict=True):
         np.testing.assert_allclose(a, b[:3] if a.ndim else b, rtol=1e-4, atol=1e-5)
     assert int(one.env_steps) == int(two.env_steps) == 90
-    assert int(one.agent.gradient_steps) == int(two.agent.gradient_steps) == 50
+    assert int(one.gradient_steps) == int(two.gradient_steps) == 50
     results = [(sweep.evaluate(state), sweep.measure(state)) for sweep, state in zip(sweeps, (one, two), strict=True)]
     for a, b in zip(*map(numbers, results), strict=True):
         assert b.shape[0] == 4

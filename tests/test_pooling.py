@@ -161,8 +161,8 @@ def test_counterparts(tmp_path):
 def test_a_rows_baseline_is_the_same_row_without_the_penalty(algo):
     baseline = ALGORITHMS[baseline_of(algo)]
     own = {name: value for name, value in ALGORITHMS[algo].settings.items() if not name.startswith("penalty")}
-    assert (baseline.make_agent, baseline.settings, baseline.training) == (
-        ALGORITHMS[algo].make_agent,
+    assert (baseline.build, baseline.settings, baseline.training) == (
+        ALGORITHMS[algo].build,
         own,
         ALGORITHMS[algo].training,
     )

@@ -32,9 +32,8 @@ def report(env_steps, returns, metrics=None, **bias):
 
 
 def outcome(**changes):
-    agent = SimpleNamespace(gradient_steps=np.int32(10))
     values = dict(
-        state=SimpleNamespace(agent=agent),
+        state=SimpleNamespace(gradient_steps=np.int32(10)),
         env_steps=20,
         interrupted=False,
         diverged={},

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sqt_jax import losses, sale
+from sqt_jax import sale
+from sqt_jax.agents import td7
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 
@@ -177,10 +178,10 @@ def test_actions_stay_within_their_limits(params):
 
 def test_encoder_loss_is_the_mean_square_over_batch_and_embedding(maybe_jit):
     zsa, next_zs = jnp.array([[1.0, 2.0], [0.0, -1.0]]), jnp.array([[0.0, 2.0], [2.0, 1.0]])
-    np.testing.assert_allclose(maybe_jit(losses.encoder_loss)(zsa, next_zs), (1 + 0 + 4 + 4) / 4)
+    np.testing.assert_allclose(maybe_jit(td7.encoder_loss)(zsa, next_zs), (1 + 0 + 4 + 4) / 4)
 
 
 def test_encoder_loss_gives_no_gradient_to_the_next_zs(maybe_jit):
-    grads = maybe_jit(jax.grad(losses.encoder_loss, argnums=(0, 1)))(ZSA, ZS)
+    grads = maybe_jit(jax.grad(td7.encoder_loss, argnums=(0, 1)))(ZSA, ZS)
     np.testing.assert_allclose(grads[0], 2 * (ZSA - ZS) / (B * Z), rtol=1e-5)
     np.testing.assert_array_equal(grads[1], np.zeros((B, Z)))

@@ -13,7 +13,7 @@ import pytest
 from sqt_jax import algorithms, envs, train
 from sqt_jax.agents import critic
 from sqt_jax.algorithms import ALGORITHMS
-from sqt_jax.members import member_axes
+from sqt_jax.members import every_leaf
 
 TINY = {
     "steps": 400,
@@ -68,7 +68,7 @@ def test_warmup_makes_steps_and_no_updates(td3):
     config, _, sweep = td3
     before = start(config, sweep)
     after, metrics = advance(sweep, start(config, sweep), 40, False)
-    assert after.env_steps == 40 and after.agent.gradient_steps == 0 and after.replay.inserted == 40
+    assert after.env_steps == 40 and after.gradient_steps == 0 and after.replay.inserted == 40
     assert identical(before.agent, after.agent)
     assert np.isnan(metrics["critic_loss"]).all() and (metrics["train_episodes"] == 40).all()
     actions = np.asarray(after.replay.storage[:, :40, 1])
@@ -79,7 +79,7 @@ def test_training_makes_one_update_per_transition(td3):
     config, _, sweep = td3
     state, _ = advance(sweep, start(config, sweep), 40, False)
     state, metrics = advance(sweep, state, 30, True)
-    assert state.env_steps == 70 and state.agent.gradient_steps == 30
+    assert state.env_steps == 70 and state.gradient_steps == 30
     assert all(np.isfinite(value).all() for value in metrics.values())
 
 
@@ -88,7 +88,7 @@ def test_updates_per_step_and_num_envs_multiply():
     state, _ = advance(sweep, start(config, sweep), 10, False)
     assert state.env_steps == 40 and state.replay.inserted == 40
     state, _ = advance(sweep, state, 5, True)
-    assert state.env_steps == 60 and state.agent.gradient_steps == 5 * 4 * 3
+    assert state.env_steps == 60 and state.gradient_steps == 5 * 4 * 3
 
 
 def test_diverged_physics_are_counted_and_never_reach_the_replay():
@@ -185,9 +185,9 @@ def test_members_differ_in_parameters_starts_and_noise(td3):
 
 @pytest.mark.slow
 def test_a_seed_starts_alone_as_in_a_sweep_bit_for_bit(td3):
-    config, _, sweep = td3
+    config, trainer, sweep = td3
     alone, together = start(config, sweep, (3,)), start(config, sweep, (0, 1, 2, 3))
-    axes = member_axes(together)
+    axes = every_leaf(trainer.member_axes, together)
     own = jax.tree.map(
         lambda leaf, axis: leaf if axis is None else leaf[3:], together, axes, is_leaf=lambda x: x is None
     )
@@ -317,11 +317,11 @@ LEARN = {
 @algorithm_rows.every(fast=("sac_sqt",))
 def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     """On `one_step` the best action is obs and Q is the reward, whatever the penalty: every step is terminal."""
-    settings = LEARN | ({} if "temperature" in ALGORITHMS[algo].ignores else {"temperature": 0.01})
+    settings = LEARN | {"temperature": 0.01}
     if ALGORITHMS[algo].settings.get("networks") == "sale":
         settings |= {"target_update_period": 50, "embedding_size": 16}
     config, trainer, sweep = make(
-        algo, **{name: v for name, v in settings.items() if name not in ALGORITHMS[algo].ignores}
+        algo, **{name: v for name, v in settings.items() if algorithm_rows.has_effect(algo, name)}
     )
     state = start(config, sweep)
     sweep = optimised(sweep, state)
@@ -330,8 +330,7 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     state, metrics = advance(sweep, state, 200, True)
     obs = jnp.linspace(-0.4, 0.4, 5)[:, None]
     agent = algorithms.agent_of(config, probe_envs.one_step())
-    axes = member_axes(state.agent)
-    act = jax.vmap(lambda s: agent.policy_action(agent.policy(s), obs), in_axes=(axes,))
+    act = jax.vmap(lambda s: agent.views.policy_action(agent.views.policy(s), obs))
     np.testing.assert_allclose(np.median(act(state.agent), axis=0), obs, atol=0.1)
     assert np.median(metrics["td_error"]) < 0.1  # targets are rewards, and these the true values
     assert (metrics["train_length"] == 1).all()
@@ -428,12 +427,12 @@ def test_critics_are_judged_by_the_policy_whose_values_they_estimate(algo):
         own = jax.tree.map(lambda x, m=member: x[m] if x.ndim else x, state.agent)
         if algo == "sac":
             # The bonus of an action is -temperature log pi: on average over many, the same along each episode.
-            _, bonus = agent.valued_act(own, jnp.repeat(obs, 4_000, axis=0), jax.random.key(1))
+            _, bonus = agent.views.sample(own, jnp.repeat(obs, 4_000, axis=0), jax.random.key(1))
             bonus = np.mean(np.asarray(bonus).reshape(3, -1), axis=1)
         else:
-            assert agent.valued_act is None
+            assert agent.views.sample is None
             bonus = np.zeros(3)
         truth = np.array([1 + 0.9 * (bonus[1] + 1 + 0.9 * (bonus[2] + 1)), 1 + 0.9 * (bonus[2] + 1), 1.0])
         action = agent.act(own, obs, jax.random.key(0), deterministic=True)
-        q = np.asarray(agent.q_values(own, obs, action)).mean(axis=0)
+        q = np.asarray(agent.views.q_values(own, obs, action)).mean(axis=0)
         assert bias["value_bias"][member] == pytest.approx(np.mean(q - truth), abs=0.3 if algo == "sac" else 1e-3)
