@@ -10,8 +10,7 @@ import numpy as np
 import probe_envs
 import pytest
 
-from sqt_jax import algorithms, envs, train
-from sqt_jax.agents import critic
+from sqt_jax import algorithms, envs, q_targets, train
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.members import every_leaf
 
@@ -384,10 +383,6 @@ def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):
     assert np.isfinite(hurt.timestep.obs).all()
 
 
-def largest_of_critics(next_q):
-    return jnp.max(next_q, axis=0)
-
-
 def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
     """The true value is 5 everywhere. The largest of five critics overestimates, a strong penalty underestimates."""
     settings = {"ensemble_size": 5, "warmup_steps": 100, "lr": 3e-3, "tau": 0.1, "gamma": 0.8, "steps": 1_000}
@@ -395,7 +390,7 @@ def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
     for name in ("largest", "smallest"):
         with monkeypatch.context() as patch:
             if name == "largest":
-                patch.setattr(critic, "_reduction", lambda config, subset: largest_of_critics)
+                patch.setitem(q_targets.REDUCTIONS, "min", lambda q, subset: jnp.max(q, axis=0))
             config, _, sweep = make.__wrapped__(
                 "td3_sqt", functools.partial(probe_envs.constant_reward, 60), **settings
             )
