@@ -2,10 +2,12 @@
 
 from sqt_jax import q_targets
 from sqt_jax.algorithms import ALGORITHMS, make_agent, make_config, make_train, make_trainer
-from sqt_jax.config import Config, ConfigError
+from sqt_jax.config import Config
 from sqt_jax.envs import make as make_env
+from sqt_jax.envs.autoreset import make_environment
 from sqt_jax.evaluate import evaluate_policy
 from sqt_jax.policy import load_policy, save_policy
+from sqt_jax.settings import ConfigError
 from sqt_jax.train import make_sweep
 from sqt_jax.types import Agent, Environment, Replay, Scalars, TimeStep, Transition
 
@@ -24,6 +26,7 @@ __all__ = [
     "make_agent",
     "make_config",
     "make_env",
+    "make_environment",
     "make_sweep",
     "make_train",
     "make_trainer",

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 Array = jax.Array
 Reduction = Callable[[Array], Array]  # next_q [N, B] -> [B]
 Penalty = Callable[[Array], Array]  # next_q [N, B] -> [B] or []
+Formula = Callable[..., Array]  # either, with settings to be bound
 
 
 def min_over_critics(next_q: Array) -> Array:
@@ -32,11 +33,6 @@ def min_over_critics(next_q: Array) -> Array:
 def mean_over_critics(next_q: Array) -> Array:
     """[N, B] -> [B]"""
     return jnp.mean(next_q, axis=0)
-
-
-def first_critic(next_q: Array) -> Array:
-    """[N, B] -> [B]"""
-    return next_q[0]
 
 
 def min_over_subset(next_q: Array, subset: Array) -> Array:
@@ -92,23 +88,19 @@ def transition_std(next_q: Array, *, coef: Array | float, ddof: int = 1) -> Arra
     return coef * std_over_critics(next_q, ddof)
 
 
-# The settings `penalty`, called with the settings `penalty_coef` and `ddof`.
-PENALTIES: dict[str, Callable[..., Array]] = {
-    "none": no_penalty,
-    "batch_std": batch_std,
-    "transition_std": transition_std,
-}
-# The settings `reduce`, called with next_q [N, B] and the update's random subset [M] of critics.
-REDUCTIONS: dict[str, Callable[..., Array]] = {
+# The setting `penalty`: called with next_q [N, B] and the settings `penalty_coef` (as coef) and `ddof`.
+PENALTIES: dict[str, Formula] = {"none": no_penalty, "batch_std": batch_std, "transition_std": transition_std}
+# The setting `reduce`: called with next_q [N, B] and the update's random subset [M] of critics.
+REDUCTIONS: dict[str, Formula] = {
     "min": lambda q, subset: min_over_critics(q),
     "mean": lambda q, subset: mean_over_critics(q),
     "subset_min": min_over_subset,
 }
-# The settings `actor_reduce`: what the actor maximises of the critics at its own action, [N, B] -> [B].
+# The setting `actor_reduce`: what the actor maximises of the critics at its own action, [N, B] -> [B].
 ACTOR_REDUCTIONS: dict[str, Reduction] = {
     "mean": mean_over_critics,  # paper eq. 9
     "min": min_over_critics,  # SAC's paper
-    "first": first_critic,  # TD3's paper
+    "first": lambda q: q[0],  # TD3's paper
 }
 
 

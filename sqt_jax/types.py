@@ -162,6 +162,16 @@ class Parts(NamedTuple):
     td_target: Callable[[State, Transition, Any], tuple[Array, dict[str, Array]]]
 
 
+def assemble(init: Init, act: Act, draw: Any, update: Any, td_target: Any, views: Views, **more: Any) -> Parts:
+    """`Parts` whose agent draws its own numbers; `more` are further fields of `Agent`."""
+
+    def update_with_key(state: State, batch: Transition, key: Array, step: Array) -> tuple[State, Array, Metrics]:
+        return update(state, batch, draw(key, batch), step)
+
+    agent = Agent(init=init, act=act, update=update_with_key, views=views, **more)
+    return Parts(agent=agent, draw=draw, update=update, td_target=td_target)
+
+
 class Replay(NamedTuple):
     """A store of transitions as pure functions of one member's state.
 

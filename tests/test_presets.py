@@ -31,7 +31,7 @@ def test_the_released_preset_makes_a_whole_run(algo):
     assert {"critic_loss", "actor_loss", "q_std"} <= history.metrics.keys()
     assert ("encoder_loss" in history.metrics) == ("assessments" in history.metrics) == algo.startswith("td7")
     assert ("entropy" in history.metrics) == algo.startswith("sac")
-    assert "log_std" in state.agent.actor["params"]
+    assert "log_std" in getattr(state.agent, "learner", state.agent).actor["params"]
     assert config.train.updates_per_step == (2 if algo.startswith("td7") else 1)
     assert config.agent.policy_delay == 2 and config.agent.actor_reduce == "mean"
     assert config.agent.penalty_coef == (1 if "_sqt" in algo else 0)

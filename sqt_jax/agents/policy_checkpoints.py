@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from sqt_jax.conditional import cond_if_any
 from sqt_jax.config import AgentConfig
-from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, State, Transition, Views
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, State, Transition, Views, assemble
 
 # The smallest return of no episodes. Finite: a value in an agent's state that is not finite means divergence.
 NO_RETURN = 1e8
@@ -142,20 +142,17 @@ def around(config: AgentConfig, learner: Parts, explore: Callable[[Array, Array]
         checkpoints = assess(config, state.checkpoints, policy, step, episode_return[0], ended_well)
         return state._replace(checkpoints=checkpoints)
 
-    return Parts(
-        agent=Agent(
-            init=init,
-            act=act,
-            update=lambda state, batch, key, step: update(state, batch, learner.draw(key, batch), step),
-            views=Views(
-                policy=lambda state: state.checkpoints.checkpoint,
-                policy_action=views.policy_action,
-                q_values=lambda state, obs, action: views.q_values(state.learner, obs, action),
-                status=lambda state: status(state.checkpoints) | views.status(state.learner),
-            ),
-            observe=observe,
-        ),
+    return assemble(
+        init=init,
+        act=act,
         draw=learner.draw,
         update=update,
         td_target=lambda state, batch, draws: learner.td_target(state.learner, batch, draws),
+        views=Views(
+            policy=lambda state: state.checkpoints.checkpoint,
+            policy_action=views.policy_action,
+            q_values=lambda state, obs, action: views.q_values(state.learner, obs, action),
+            status=lambda state: status(state.checkpoints) | views.status(state.learner),
+        ),
+        observe=observe,
     )

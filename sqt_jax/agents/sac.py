@@ -4,6 +4,7 @@ Temperature fixed (https://arxiv.org/abs/1801.01290) or learned. Differs from th
 the critics (SQT paper, eq. 9), not the minimum; see BUILD_NOTES.md.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from sqt_jax.agents import critic as critics
 from sqt_jax.config import AgentConfig
 from sqt_jax.gaussian import GaussianActor
 from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
-from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, Transition, Views
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
 
 
 class SACState(NamedTuple):
@@ -98,12 +99,10 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return target, terms | {"next_log_prob": next_log_prob}
 
     def update_critic(state: SACState, batch: Transition, draws: SACDraws) -> tuple[SACState, Array, Metrics]:
-        target, terms = td_target(state, batch, draws)
-
         def q_values(critic):
             return critic_net.apply(critic, batch.obs, batch.action)
 
-        return critics.update(config, state, q_values, target, terms)
+        return critics.update(config, state, q_values, *td_target(state, batch, draws))
 
     def update_actor(state: SACState, batch: Transition, draws: SACDraws) -> tuple[SACState, Metrics]:
         """The reparametrised policy loss (eq. 9), and the temperature's step where it is learned."""
@@ -147,10 +146,5 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         q_values=lambda state, obs, action: critic_net.apply(state.critic, obs, action),
         sample=sample_with_bonus,
     )
-    agent = Agent(
-        init=init,
-        act=act,
-        update=lambda state, batch, key, step: update(state, batch, draw(key, batch, config), step),
-        views=views,
-    )
-    return Parts(agent=agent, draw=lambda key, batch: draw(key, batch, config), update=update, td_target=td_target)
+    draws = functools.partial(draw, config=config)
+    return assemble(init=init, act=act, draw=draws, update=update, td_target=td_target, views=views)

@@ -3,6 +3,7 @@
 Differs from the paper: the actor maximises the critics' mean (SQT paper, eq. 9), not the first (see BUILD_NOTES.md).
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from sqt_jax import networks, q_targets
 from sqt_jax.agents import critic as critics
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
-from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, Transition, Views
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
 
 
 class TD3State(NamedTuple):
@@ -82,12 +83,10 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return critics.td_target(config, state.scalars, batch, next_q, draws.subset)
 
     def update_critic(state: TD3State, batch: Transition, draws: TD3Draws) -> tuple[TD3State, Array, Metrics]:
-        target, terms = td_target(state, batch, draws)
-
         def q_values(critic):
             return critic_net.apply(critic, batch.obs, batch.action)
 
-        return critics.update(config, state, q_values, target, terms)
+        return critics.update(config, state, q_values, *td_target(state, batch, draws))
 
     def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
         """The deterministic policy gradient (eq. 2) of the critics' mean."""
@@ -102,11 +101,9 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), loss
 
     def update_targets(state: TD3State) -> TD3State:
-        tau, diverged = state.scalars.tau, state.diverged
-        return state._replace(
-            target_actor=soft_update(state.target_actor, state.actor, tau, diverged),
-            target_critic=soft_update(state.target_critic, state.critic, tau, diverged),
-        )
+        pairs = (state.target_actor, state.target_critic), (state.actor, state.critic)
+        actor, critic = soft_update(*pairs, state.scalars.tau, state.diverged)
+        return state._replace(target_actor=actor, target_critic=critic)
 
     def update(state: TD3State, batch: Transition, draws: TD3Draws, step: Array) -> tuple[TD3State, Array, Metrics]:
         state, td_error, metrics = update_critic(state, batch, draws)
@@ -127,10 +124,5 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         policy_action=actor_net.apply,
         q_values=lambda state, obs, action: critic_net.apply(state.critic, obs, action),
     )
-    agent = Agent(
-        init=init,
-        act=act,
-        update=lambda state, batch, key, step: update(state, batch, draw(key, batch, config), step),
-        views=views,
-    )
-    return Parts(agent=agent, draw=lambda key, batch: draw(key, batch, config), update=update, td_target=td_target)
+    draws = functools.partial(draw, config=config)
+    return assemble(init=init, act=act, draw=draws, update=update, td_target=td_target, views=views)

@@ -18,7 +18,7 @@ from sqt_jax.agents import critic as critics
 from sqt_jax.agents import policy_checkpoints, td3
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step, overflows
-from sqt_jax.types import Agent, Array, Metrics, Params, Parts, Scalars, Transition, Views
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
 
 UNBOUNDED = 1e30  # far beyond `critic.LARGEST_VALUE`, and finite
 
@@ -262,10 +262,4 @@ def build_learner(
         sample=sample if rules.sample else None,
         status=status if clip_values else lambda state: {},
     )
-    agent = Agent(
-        init=init,
-        act=act,
-        update=lambda state, batch, key, step: update(state, batch, rules.draw(key, batch), step),
-        views=views,
-    )
-    return Parts(agent=agent, draw=rules.draw, update=update, td_target=td_target)
+    return assemble(init=init, act=act, draw=rules.draw, update=update, td_target=td_target, views=views)
