@@ -129,7 +129,7 @@ def make_agent_config(algo: str, **settings: Any) -> AgentConfig:
     return config
 
 
-def make_config(algo: str, env: str, **settings: Any) -> Config:
+def make_config(algo: str, env: "str | Environment", **settings: Any) -> Config:
     """A whole experiment's checked settings.
 
     Args:
@@ -145,11 +145,21 @@ def make_config(algo: str, env: str, **settings: Any) -> Config:
     if algo in ALGORITHMS:
         _refuse_unknown(settings, AGENT_SETTINGS | TRAIN_SETTINGS)
     agent = make_agent_config(algo, **settings)
-    try:
-        env = envs.resolve(env)
-    except ValueError as error:
-        raise ConfigError("env", str(error)) from None
-    known = envs.simulators(env)
+    if isinstance(env, Environment):
+        if physics is not None or eval_physics != "auto":
+            raise ConfigError("physics", "has no effect with an environment of your own")
+        env, physics = env.name, "own"
+    if physics == "own":
+        if not isinstance(env, str):
+            raise ConfigError("env", "expects a name")
+        known: tuple[str, ...] = ("own",)
+        eval_physics = "own"
+    else:
+        try:
+            env = envs.resolve(env)
+        except ValueError as error:
+            raise ConfigError("env", str(error)) from None
+        known = tuple(envs.simulators(env))
     physics = physics or known[0]
     if physics not in known:
         raise ConfigError("physics", f"{unknown(physics, known)} for {env}")

@@ -118,7 +118,7 @@ def _file_values(name: str) -> dict[str, Any]:
         raise UsageError(f"{error} (in {name})") from None
 
 
-def parse(argv: Sequence[str]) -> Options | None:
+def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
     """A command line (program name first) as `Options`; None where it asks for help.
 
     Raises `UsageError` for everything the text alone gives away.
@@ -135,7 +135,7 @@ def parse(argv: Sequence[str]) -> Options | None:
     if resume == "":
         raise UsageError("--resume=: expects the folder of a run, or nothing at all: --resume")
     folder_given = resume not in (None, LATEST)
-    for required in ("algo", "env"):
+    for required in ("algo", "env") if needs_env else ("algo",):
         if not own[required] and resume in (None, LATEST):
             raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
     if resume is not None and overwrite:
