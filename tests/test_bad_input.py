@@ -8,12 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import probe_envs
 import pytest
 
 from experiments.run import main
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
@@ -23,7 +22,7 @@ RUN = Path("runs/ant/sac_sqt/run")
 
 
 def run(*arguments):
-    return main(["experiments.run", *arguments], env=probe_envs.constant_reward())
+    return main(["experiments.run", *arguments])
 
 
 @pytest.fixture(scope="module")
@@ -259,8 +258,8 @@ CHANGED = {
     "swept setting": (entries(swept=["hidden"]), "does not describe a run"),
     "swept twice": (entries(swept=["lr", "lr"]), "does not describe a run"),
     "swept without values": (entries(swept=["lr"]), "does not describe a run"),
-    "replay too large": (entries(replay_rows=10**400), "a replay that cannot be"),
-    "replay without rows": (entries(replay_rows=0), "a replay that cannot be"),
+    "replay too large": (entries(replay_rows=10**400), "an invalid replay capacity"),
+    "replay without rows": (entries(replay_rows=0), "an invalid replay capacity"),
     "replay of no size": (entries(replay_rows=None), "does not describe a run"),
     "output that is a list": (entries(output=[]), "does not describe a run"),
     "nan": (entries(device=float("nan")), "does not describe a run"),
@@ -412,7 +411,7 @@ NOT_RUNS = [foreign_file, foreign_folder, a_link_below, a_link_itself, a_link_to
 @pytest.mark.parametrize("change", NOT_RUNS, ids=[change.__name__ for change in NOT_RUNS])
 def test_what_is_not_a_run_alone_is_not_replaced(folder, capsys, change):
     change(RUN)
-    expects = "expects a folder with a run alone"
+    expects = "expects a folder that holds a run and nothing else"
     refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", expects)
 
 
@@ -437,7 +436,7 @@ def test_a_run_at_which_another_process_is_at_work_is_refused(folder, capsys):
     root = Path(__file__).resolve().parent.parent
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=root) as holder:
         assert holder.stdout.readline() == "locked\n"
-        expects = f"process {holder.pid} is at work on {RUN}; expects another run"
+        expects = f"process {holder.pid} is training {RUN}; expects another run"
         refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--name=run:", expects)
         refused(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", expects)
         holder.stdin.close()

@@ -8,16 +8,14 @@ import subprocess
 import sys
 
 import numpy as np
-import probe_envs
 import pytest
 
-import experiments.run
 from experiments.run import main
-from experiments.running import records
+from experiments.running import records, session
 from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 
 # The members and sizes that these runs have in common, so that they share compiled programs.
 TINY = (
@@ -28,7 +26,7 @@ SMALL = "--steps=30 --warmup_steps=20 --eval_every=30 --eval_episodes=1 --batch_
 
 
 def run(out, *arguments):
-    return main(["experiments.run", *TINY.split(), f"--out={out}", *arguments], env=probe_envs.constant_reward(5))
+    return main(["experiments.run", *TINY.split(), f"--out={out}", *arguments])
 
 
 def rows_of(path):
@@ -229,32 +227,10 @@ def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsy
     assert json.loads((path / "config.json").read_text())["settings"]["algo"] == "sac_sqt"
 
 
-def test_a_second_signal_ends_the_process_at_once(monkeypatch):
-    codes = []
-    monkeypatch.setattr(experiments.run.os, "_exit", codes.append)
-    with experiments.run._stop_on_signal() as received:
-        signal.raise_signal(signal.SIGTERM)
-        assert received == [signal.SIGTERM] and codes == []
-        signal.raise_signal(signal.SIGINT)
-        assert codes == [130]
-
-
-def test_a_sigterm_that_comes_twice_at_once_is_one(monkeypatch):
-    """By a batch system and by `experiments.sweep`, which passes its own on."""
-    codes, now = [], []
-    monkeypatch.setattr(experiments.run.os, "_exit", codes.append)
-    monkeypatch.setattr(experiments.run.time, "monotonic", lambda: now[-1])
-    with experiments.run._stop_on_signal() as received:
-        for at, left in [(100.0, []), (100.9, []), (102.0, [130])]:
-            now.append(at)
-            signal.raise_signal(signal.SIGTERM)
-            assert received[0] == signal.SIGTERM and codes == left
-
-
 def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
     arguments = TINY.removesuffix(" --name=run").split()
     options = ["--penalty_coef=0,0.5", "--quiet", f"--out={tmp_path}"]
-    assert main(["experiments.run", *arguments, *options], env=probe_envs.constant_reward(5)) == 0
+    assert main(["experiments.run", *arguments, *options]) == 0
     (path,) = (tmp_path / "ant" / "sac_sqt").iterdir()
     assert path.name.startswith("steps=120_warmup_steps=30_batch_size=8_") and "penalty_coef=0.0+0.5" in path.name
     assert path.name[-1] == "Z"
@@ -335,7 +311,7 @@ def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(experiments.run, "save_policy", full)
+    monkeypatch.setattr(session, "save_policy", full)
     assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 1
     assert "the results cannot be written: " in capsys.readouterr().err
     assert not (tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").exists()

@@ -3,12 +3,13 @@
 import json
 
 import jax
-import probe_envs
 import pytest
 
 from experiments.commandline import flags
 from experiments.running import run_config
 from experiments.running.plan import make_plan
+
+pytestmark = pytest.mark.usefixtures("tiny_tasks")
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
@@ -18,14 +19,14 @@ NEW = (
 
 def plan(out, *arguments, new=NEW):
     options = flags.parse(["run", *new.split(), *([f"--out={out}"] if new else []), *arguments])
-    return make_plan(options, probe_envs.constant_reward())
+    return make_plan(options)
 
 
 def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", **output):
     """A run that has written its config.json."""
     made = plan(out, f"--name={name}", *arguments)
     made.path.mkdir(parents=True)
-    content = run_config.describe(made.members, made.swept, ["run"], made.options.preset, made.output | output)
+    content = run_config.new_content(made.members, made.swept, ["run"], made.options.preset, made.output | output)
     run_config.write(made.path, content | {"started": started})
     return made.path
 
