@@ -117,7 +117,7 @@ def check_flags() -> None:
         sys.exit(f"--json: expects a file in a folder that is there, not {FLAGS.json!r}")
     if "growth" in FLAGS.suites:
         with leaving():
-            arguments.refuse_folder("--figures", Path(FLAGS.figures))
+            arguments.reject_folder("--figures", Path(FLAGS.figures))
     for peer in FLAGS.compare:
         if not {*compare.ALGORITHMS[peer]} & {*FLAGS.algos}:
             sys.exit(f"--algos: expects some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
@@ -289,7 +289,7 @@ def save(found: Sequence[Row], failed: Sequence[Failure], peak: float) -> None:
     report = {"machine": machine(), "peak": peak, "rows": [dataclasses.asdict(row) for row in found]}
     report["failed"] = [failure._asdict() for failure in failed]
     try:
-        with files.whole_file(Path(FLAGS.json)) as file:
+        with files.atomic_file(Path(FLAGS.json)) as file:
             file.write((json.dumps(report, indent=1) + "\n").encode())
     except OSError as error:
         sys.exit(f"--json={FLAGS.json}: expects a file that can be written: {error.strerror}")
@@ -318,7 +318,7 @@ def main(argv: Sequence[str]) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     environment = dict(os.environ)  # before our own options for XLA are in it
     runtime.prepare()
-    runtime.divide_processor(most_devices())
+    runtime.set_cpu_device_count(most_devices())
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are figures here
     print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
     devices_here()

@@ -210,7 +210,7 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     if FLAGS.out:
         with leaving():
-            arguments.refuse_file("--out", Path(FLAGS.out), overwrite=True)
+            arguments.reject_file("--out", Path(FLAGS.out), overwrite=True)
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
     rows = cases(physics_here())

@@ -137,7 +137,7 @@ def _prepare(path: Path, options: argparse.Namespace) -> None:
             if given:
                 raise UsageError(f"{flag}: has no effect without --video")
         return
-    arguments.refuse_file("--video", options.video, options.overwrite)
+    arguments.reject_file("--video", options.video, options.overwrite)
     name = _env_name(path)
     if name.startswith(BRAX):
         if films.format_of(options.video) != "html":
@@ -213,7 +213,7 @@ def _film(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if task.env.name.startswith(BRAX):
-            with files.whole_file(path) as file:
+            with files.atomic_file(path) as file:
                 written = file.write(brax_pages.page(task.scene, [episode.shown for episode in played]))
             print(f"{path}: {written / 1e6:,.2f} MB, for a browser that may fetch Brax's viewer")
             return

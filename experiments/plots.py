@@ -38,7 +38,7 @@ def command(argv: Sequence[str]) -> None:
 
     runs = pooling.collect(options.runs)
     draw = figures.every(runs, options.statistic)
-    arguments.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
+    arguments.reject_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
     drawn = {name: function() for name, function in draw.items()}
     contents = {
         f"{name}.{options.format}": figures.image(figure, options.format) for name, figure in drawn.items() if figure

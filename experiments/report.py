@@ -35,7 +35,7 @@ def parser() -> Parser:
 
 def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
-    arguments.refuse_file("--out", options.out, options.overwrite)
+    arguments.reject_file("--out", options.out, options.overwrite)
     from experiments.evidence import figures, page, paper_tables, pooling, run_details
     from experiments.running import run_config  # they take a second or two
 

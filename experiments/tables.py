@@ -39,7 +39,7 @@ def command(argv: Sequence[str]) -> None:
     runs = pooling.collect(options.runs)
     if options.out:
         names = [f"{name}.{suffix}" for name in paper_tables.NAMES for suffix, _ in formats.FORMATS.values()]
-        arguments.refuse_existing(options.out, names, options.overwrite)
+        arguments.reject_existing(options.out, names, options.overwrite)
     tables = paper_tables.make_tables(runs, options.reference, paper_tables.task_sizes(runs))
     if options.out:
         contents = {

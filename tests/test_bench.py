@@ -46,7 +46,7 @@ def run(monkeypatch, tmp_path):
             bench.main(["bench"])
 
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
-    monkeypatch.setattr(bench.runtime, "divide_processor", lambda devices: None)
+    monkeypatch.setattr(bench.runtime, "set_cpu_device_count", lambda devices: None)
     cached = jax.config.jax_enable_compilation_cache
     yield main
     jax.config.update("jax_enable_compilation_cache", cached)
@@ -212,7 +212,7 @@ def test_a_peer_that_is_not_installed_is_told_before_anything_runs(monkeypatch):
 
 def test_more_devices_than_there_are_are_refused(monkeypatch):
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
-    monkeypatch.setattr(bench.runtime, "divide_processor", lambda devices: None)
+    monkeypatch.setattr(bench.runtime, "set_cpu_device_count", lambda devices: None)
     cached = jax.config.jax_enable_compilation_cache
     bench.FLAGS.mark_as_parsed()
     try:

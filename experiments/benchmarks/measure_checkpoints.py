@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.measure import Row, member_keys
-from experiments.running.checkpoints import Checkpoints
+from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
 from sqt_jax import algorithms, envs, train
 from sqt_jax.members import layout_here
@@ -31,13 +31,13 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     everything, later, waits, size = [], [], [], 0
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
-            store = Checkpoints(Path(folder), replay, layout, 2, print)
+            store = CheckpointStore(Path(folder), replay, layout, 2, print)
             save(store, state, FILLED - SINCE)
             waiting, whole = save(store, state, FILLED)
             waits.append(waiting)
             later.append(whole)
         with tempfile.TemporaryDirectory() as folder:
-            everything.append(save(Checkpoints(Path(folder), replay, layout, 2, print), state, FILLED)[1])
+            everything.append(save(CheckpointStore(Path(folder), replay, layout, 2, print), state, FILLED)[1])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
     def row(what: str, seconds: list[float]) -> Row:
@@ -48,7 +48,7 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     yield row(f"{SINCE:,} new rows, until training goes on", waits)
 
 
-def save(store: Checkpoints, state: train.TrainState, at: int) -> tuple[float, float]:
+def save(store: CheckpointStore, state: train.TrainState, at: int) -> tuple[float, float]:
     """Seconds until training could go on, and until the checkpoint is on disk."""
     began = time.perf_counter()
     store.save(state, Position(at, at), {})

@@ -110,7 +110,7 @@ def _file_values(name: str) -> dict[str, Any]:
     """The flags of a YAML file, parsed as those of a command line."""
     try:
         arguments = config_file.arguments(Path(name))
-    except config_file.Refused as error:
+    except config_file.InvalidConfigFile as error:
         raise UsageError(f"--config={name}: {error}") from None
     try:
         return _values(["", *arguments])

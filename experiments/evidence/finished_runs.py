@@ -71,7 +71,7 @@ def read_run(path: Path) -> list[Curves]:
     try:
         run = run_config.read(path)
         columns = _read_table(path / "evaluations.csv")
-    except run_config.NotDescribed as error:
+    except run_config.InvalidRunConfig as error:
         raise UsageError(f"{path}: {error}") from None
     except OSError as error:
         raise UsageError(f"{path}: its evaluations.csv cannot be read ({error.strerror})") from None

@@ -76,7 +76,7 @@ def read(path: Path, curves: Sequence[Curves]) -> Details:
     """
     try:
         run = run_config.read(path)
-    except run_config.NotDescribed as error:
+    except run_config.InvalidRunConfig as error:
         raise UsageError(f"{path}: {error}") from None
     config, content = run.members[0].config, run.content
     status, end = _end(path, bool(content["resumed"]))
@@ -135,7 +135,7 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _changed(run: run_config.Described) -> list[Setting]:
+def _changed(run: run_config.RunConfig) -> list[Setting]:
     config = run.members[0].config
     own, default = run_config.settings_of(run.members, run.swept), make_config(config.algo, config.env).flat()
     return [

@@ -69,7 +69,7 @@ def encode(frames: Iterable[np.ndarray], period: float, name: str, caption: str 
 def write(path: Path, frames: Iterable[np.ndarray], period: float, caption: str = "") -> int:
     """Writes a film in the format of the file's name, whole or not at all; its bytes. Raises as `encode`."""
     content = encode(frames, period, format_of(path), caption)
-    with files.whole_file(path) as file:
+    with files.atomic_file(path) as file:
         return file.write(content)
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import UsageError
 from experiments.running import files, run_config
-from experiments.running.run_config import Described, Member
+from experiments.running.run_config import Member, RunConfig
 from sqt_jax.policy import load_policy
 from sqt_jax.types import Array, Environment
 
@@ -21,11 +21,11 @@ class Chosen(NamedTuple):
     why: str  # it was chosen, in words
 
 
-def read(path: Path) -> Described:
+def read(path: Path) -> RunConfig:
     """The run in a folder. Raises `UsageError` where there is none."""
     try:
         return run_config.read(path)
-    except run_config.NotDescribed as error:
+    except run_config.InvalidRunConfig as error:
         raise UsageError(f"{path}: expects the folder of a run; {error}") from None
 
 
@@ -41,7 +41,7 @@ def final_returns(path: Path, count: int) -> list[float]:
     return returns
 
 
-def choose(run: Described, returns: Sequence[float], seed: int | None = None, number: int | None = None) -> Chosen:
+def choose(run: RunConfig, returns: Sequence[float], seed: int | None = None, number: int | None = None) -> Chosen:
     """The member that is asked for: by its number, or of those with that seed (of all) the best.
 
     Args:
@@ -75,7 +75,7 @@ def choose(run: Described, returns: Sequence[float], seed: int | None = None, nu
     return Chosen(best, members[best], why)
 
 
-def told(run: Described, chosen: Chosen) -> str:
+def told(run: RunConfig, chosen: Chosen) -> str:
     """What is played, in a line."""
     config = chosen.member.config
     values = "".join(f", {name} {getattr(config.agent, name):g}" for name in run.swept)
