@@ -3,6 +3,7 @@
 import json
 
 import jax
+import probe_envs
 import pytest
 
 from experiments.commandline import flags
@@ -22,11 +23,13 @@ def plan(out, *arguments, new=NEW):
     return make_plan(options)
 
 
-def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", **output):
-    """A run that has written its config.json."""
-    made = plan(out, f"--name={name}", *arguments)
+def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", env=None, **output):
+    """A run that has written its config.json; `env` is handed in."""
+    made = own_plan(out, env, f"--name={name}", *arguments) if env else plan(out, f"--name={name}", *arguments)
     made.path.mkdir(parents=True)
-    content = run_config.new_content(made.members, made.swept, ["run"], made.options.preset, made.output | output)
+    content = run_config.new_content(
+        made.members, made.swept, ["run"], made.options.preset, made.output | output, made.own_env
+    )
     run_config.write(made.path, content | {"started": started})
     return made.path
 
@@ -177,3 +180,59 @@ def test_devices_that_nobody_named_are_chosen_anew_where_a_run_goes_on(tmp_path,
     with pytest.raises(flags.UsageError, match="^--devices=2: expects at most 1 here$"):
         plan(tmp_path, f"--resume={named}", "--devices=2", new="")
     assert len(plan(tmp_path, f"--resume={named}", "--devices=1", new="").layout.devices) == 1
+
+
+# An environment handed in. Needs `make_config` to accept an `Environment`, and `flags.parse(argv, needs_env=False)`.
+
+OWN = NEW.replace("--env=ant ", "")
+
+
+def own_plan(out, env, *arguments, new=OWN):
+    argv = ["run", *new.split(), *([f"--out={out}"] if new else []), *arguments]
+    return make_plan(flags.parse(argv, needs_env=False), env)
+
+
+def point(name="my point", **changes):
+    return probe_envs.constant_reward()._replace(name=name, **changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"), [("point", "point"), ("a/b c:d", "a-b-c-d"), ("v1.5_x-y", "v1.5_x-y"), ("ant", "ant")]
+)
+def test_an_environment_handed_in_names_the_folder(tmp_path, name, folder):
+    made = own_plan(tmp_path, point(name), "--name=a")
+    assert made.path == tmp_path / folder / "sac_sqt" / "a" and made.env is made.own_env
+    assert (made.config.env, made.config.physics, made.config.eval_physics) == (name, "own", "own")
+    assert own_plan(tmp_path, point(name), "--name=a", f"--env={name}").path == made.path
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("", [], "^env: expects an environment with a name that can name a folder, not ''$"),
+        ("..", [], "^env: expects an environment with a name that can name a folder, not '..'$"),
+        ("point", ["--env=ant"], "^--env=ant: expects 'point', the name of the environment handed in, or no --env$"),
+        ("point", ["--physics=mjx"], "^--physics: has no effect with an environment handed in$"),
+        ("point", ["--eval_physics=mjx"], "^--eval_physics: has no effect with an environment handed in$"),
+    ],
+)
+def test_what_contradicts_an_environment_handed_in_is_rejected(tmp_path, name, arguments, message):
+    with pytest.raises(flags.UsageError, match=message):
+        own_plan(tmp_path, point(name), "--name=a", *arguments)
+
+
+def test_own_physics_needs_an_environment_handed_in(tmp_path):
+    with pytest.raises(flags.UsageError, match="^--physics=own: expects an environment handed in: run.main"):
+        plan(tmp_path, "--name=a", "--physics=own")
+
+
+def test_runs_of_the_task_of_that_name_are_told_apart(tmp_path):
+    task = begun(tmp_path, "task")
+    with pytest.raises(flags.UsageError, match="expects no environment handed in; the run was trained on ant"):
+        own_plan(tmp_path, point("ant"), f"--resume={task}", new="")
+    with pytest.raises(flags.UsageError, match="^--resume: there is no run of these settings"):
+        own_plan(tmp_path, point("ant"), "--resume")
+    own = begun(tmp_path, "own", env=point("ant"))
+    assert own_plan(tmp_path, point("ant"), "--resume").path == own and plan(tmp_path, "--resume").path == task
+    with pytest.raises(flags.UsageError, match="these differ: physics .its own: own, now: mjx."):
+        plan(tmp_path, "--resume", "--name=own")
