@@ -85,7 +85,7 @@ def cells_of(grid: Grid, algos: Sequence[str], tasks: Sequence[str], out: Path, 
             run_flags = (*grid.flags, *flags)
             name = run_name(run_flags)
             command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name}", "--resume", *run_flags)
-            cells.append(Cell(task, algo, out / task / algo / name, command))
+            cells.append(Cell(task=task, algo=algo, path=out / task / algo / name, command=command))
     return cells
 
 

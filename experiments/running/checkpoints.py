@@ -165,7 +165,8 @@ class CheckpointStore:
             written = files.below(part / "state")
             state = {name: (path.stat().st_size, files.crc(path)) for name, path in written.items()}
             rows = rows_needed(self._rows, step.env_steps, capacity)
-            manifests.write(part / "manifest.json", Manifest(state, rows, position, lengths))
+            manifest = Manifest(state=state, rows=rows, position=position, lengths=lengths)
+            manifests.write(part / "manifest.json", manifest)
             for folder in {path.parent for path in written.values()} | {part}:
                 files.sync_folder(folder)
             part.rename(self.path / step.name)

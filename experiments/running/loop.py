@@ -137,7 +137,15 @@ def train_loop(
 
     def show(phase: str, learn: bool) -> None:
         rate = pace.rates[learn] * train.num_envs * num_members if learn in pace.rates else None
-        display.update(Status(phase, done, rate, pace.time_left(done, evaluated, train), last_return))
+        display.update(
+            Status(
+                phase=phase,
+                env_steps=done,
+                steps_per_second=rate,
+                left=pace.time_left(done, evaluated, train),
+                last_return=last_return,
+            )
+        )
 
     def evaluate_and_report() -> None:
         nonlocal last_return, evaluated
@@ -172,12 +180,28 @@ def train_loop(
     def send(returns: np.ndarray | None, lengths: np.ndarray | None, bias: dict[str, np.ndarray]) -> None:
         """Reports the interval since the last evaluation, which has no metrics before the first step."""
         metrics = {name: of_members(value) for name, value in sweep.measure(state).items()} if done else {}
-        report(Report(done, int(state.agent.gradient_steps), clock() - began, metrics, returns, lengths, bias))
+        report(
+            Report(
+                env_steps=done,
+                gradient_steps=int(state.agent.gradient_steps),
+                wall_seconds=clock() - began,
+                metrics=metrics,
+                returns=returns,
+                lengths=lengths,
+                bias=bias,
+            )
+        )
 
     def save_here() -> None:
         if checkpoint_every:
             show("saving", done >= train.warmup_steps)
-            save(state, Position(done, evaluated, tuple(diverged.items()), clock() - began))
+            position = Position(
+                env_steps=done,
+                evaluated=evaluated,
+                diverged=tuple(diverged.items()),
+                wall_seconds=clock() - began,
+            )
+            save(state, position)
 
     evaluations = {step for step in evaluation_steps(train) if step > evaluated}
     checkpoints = set(checkpoint_steps(checkpoint_every, done, train.steps))
@@ -210,4 +234,12 @@ def train_loop(
 
     timed = pace.steps * train.num_envs * num_members
     rate = timed / pace.train_seconds if pace.train_seconds else None
-    return Outcome(state, done, interrupted, diverged, clock() - began, pace.train_seconds, rate)
+    return Outcome(
+        state=state,
+        env_steps=done,
+        interrupted=interrupted,
+        diverged=diverged,
+        wall_seconds=clock() - began,
+        train_seconds=pace.train_seconds,
+        steps_per_second=rate,
+    )

@@ -110,7 +110,8 @@ def read(folder: Path, step: Step) -> Manifest:
         if min(lengths.values(), default=0) < 0:
             raise ValueError
         state = {str(name): (int(size), int(crc)) for name, (size, crc) in content["state"].items()}
-        return Manifest(state, rows, _position(content["position"], step.env_steps), lengths)
+        position = _position(content["position"], step.env_steps)
+        return Manifest(state=state, rows=rows, position=position, lengths=lengths)
     except (FileNotFoundError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise DamagedCheckpoint(f"its manifest.json cannot be read ({type(error).__name__})") from None
     except OSError as error:
@@ -155,7 +156,12 @@ def own_crc(content: dict[str, Any]) -> int:
 def _position(values: dict[str, Any], env_steps: int) -> Position:
     """The position in a manifest of the step `env_steps`. Raises ValueError, TypeError or KeyError if it is invalid."""
     diverged = tuple((int(member), int(step)) for member, step in values["diverged"])
-    position = Position(int(values["env_steps"]), int(values["evaluated"]), diverged, float(values["wall_seconds"]))
+    position = Position(
+        env_steps=int(values["env_steps"]),
+        evaluated=int(values["evaluated"]),
+        diverged=diverged,
+        wall_seconds=float(values["wall_seconds"]),
+    )
     if position.env_steps != env_steps or not -1 <= position.evaluated <= env_steps or not position.wall_seconds >= 0:
         raise ValueError
     return position

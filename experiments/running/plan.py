@@ -145,15 +145,17 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
     folder = Path(options.out) / (_folder_name(env.name) if env else default.env) / default.algo
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
-        return _Target(members, swept, path, None)
+        return _Target(members=members, swept=swept, path=path, resumed=None)
     wanted = run_config.settings_of(members, swept) | run_config.sizes_of(env)
     if options.name is None:
         path, run = resume.latest(folder, wanted)
     elif not _exists(path / run_config.NAME):
-        return _Target(members, swept, path, None)  # so that one command both starts a run and resumes it
+        return _Target(
+            members=members, swept=swept, path=path, resumed=None
+        )  # so that one command both starts a run and resumes it
     else:
         run = resume.check(path, resume.read(path), wanted, options.devices)
-    return _Target(resume.with_original_replay(run), run.swept, path, run)
+    return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
 def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
@@ -177,7 +179,7 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
         except ValueError as error:
             raise UsageError(f"--env: {error}") from None
     run = resume.check(path, run, wanted, options.devices)
-    return _Target(resume.with_original_replay(run), run.swept, path, run)
+    return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
 def _output(options: flags.Options, run: RunConfig | None, train: TrainConfig) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -138,7 +139,7 @@ class Session:
         return at.env_steps == at.evaluated == self.plan.train.steps and results
 
     @property
-    def _summary(self):
+    def _summary(self) -> Path:
         return self.plan.path / "summary.json"
 
     def _claim(self) -> None:
