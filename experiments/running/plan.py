@@ -150,9 +150,8 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
     if options.name is None:
         path, run = resume.latest(folder, wanted)
     elif not _exists(path / run_config.NAME):
-        return _Target(
-            members=members, swept=swept, path=path, resumed=None
-        )  # so that one command both starts a run and resumes it
+        # A new run: one command both starts a run and resumes it.
+        return _Target(members=members, swept=swept, path=path, resumed=None)
     else:
         run = resume.check(path, resume.read(path), wanted, options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)

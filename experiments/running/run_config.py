@@ -100,7 +100,7 @@ def new_content(
         "versions": versions(),
         "resumed": [],
     }
-    return content | ({"own_env": sizes_of(own_env)} if own_env else {})
+    return content if own_env is None else content | {"own_env": sizes_of(own_env)}
 
 
 def read(path: Path) -> RunConfig:
