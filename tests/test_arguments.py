@@ -40,7 +40,7 @@ def test_runs_and_flags_in_any_order(parser):
         (["a", "--overwrite=yes"], "--overwrite: is a switch and expects no value"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(parser, argv, message):
+def test_what_cannot_be_is_rejected_in_a_line(parser, argv, message):
     with pytest.raises(UsageError) as error:
         parser.read(["tables", *argv])
     assert str(error.value) == message
@@ -113,7 +113,7 @@ def test_what_is_not_to_be_seen_is_escaped():
     assert arguments.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"
 
 
-def test_a_command_for_one_run_takes_one():
+def test_a_command_for_one_run_expects_one():
     made = Parser("What it does.", "python -m experiments.play RUN --video=FILE", one=True)
     made.add_argument("--seed", type=between(0, 9), metavar="N")
     assert made.prog == "python -m experiments.play"
@@ -129,7 +129,7 @@ def test_a_command_for_one_run_takes_one():
             made.read(["play", "a", f"--seed={text}"])
 
 
-def test_a_file_that_could_not_be_written_is_refused_before(tmp_path):
+def test_a_file_that_could_not_be_written_is_rejected_before(tmp_path):
     reject_file("--video", tmp_path / "new" / "folder" / "film.mp4", overwrite=False)
     (tmp_path / "film.mp4").write_text("x")
     (tmp_path / "link.mp4").symlink_to("nowhere")

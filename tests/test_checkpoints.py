@@ -1,4 +1,4 @@
-"""CheckpointStore: exact, written once, whole or not there, and no danger to the run."""
+"""Checkpoints: exact, written once, complete or absent; a failure does not stop the run."""
 
 import errno
 import os
@@ -160,7 +160,7 @@ def full(*_):
 
 
 def disk_is_full_for_rows(monkeypatch):
-    monkeypatch.setattr(files, "whole_file", full)
+    monkeypatch.setattr(files, "atomic_file", full)
 
 
 def disk_is_full_for_the_state(monkeypatch):
@@ -171,10 +171,10 @@ def disk_is_full_for_the_state(monkeypatch):
 
 
 def disk_is_full_for_the_manifest(monkeypatch):
-    def whole_file(path, original=files.atomic_file):
+    def atomic_file(path, original=files.atomic_file):
         return full() if path.name == "manifest.json" else original(path)
 
-    monkeypatch.setattr(files, "whole_file", whole_file)
+    monkeypatch.setattr(files, "atomic_file", atomic_file)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
         store.wait()
     (warning,) = case.said
     assert "no checkpoint at step 70" in warning and "No space left" in warning
-    assert "the one at step 60 is whole" in warning
+    assert "the last valid one is at step 60" in warning
     assert not [name for name in listing(store) if name.endswith(".part")]
     # The older one is as good as before, and with room again there is a newer one.
     state = case.sweep.advance(state, 10, True)
@@ -271,7 +271,7 @@ def test_a_file_that_cannot_be_read_is_no_reason_to_give_a_checkpoint_up(case, t
     assert case.said == [] and listing(store) == before
 
 
-def test_another_format_is_refused_and_kept(case, tmp_path, monkeypatch):
+def test_another_format_is_rejected_and_kept(case, tmp_path, monkeypatch):
     store = case.store(tmp_path)
     case.saved(store, 50, 60)
     before = listing(store)

@@ -124,7 +124,7 @@ def test_summary_of_a_run(finished):
     assert summary["diverged"] == []
 
 
-def test_a_directory_that_holds_a_run_is_refused(finished, capsys):
+def test_a_directory_that_holds_a_run_is_rejected(finished, capsys):
     path = finished[1]
     before = {item: item.stat().st_mtime_ns for item in path.rglob("*")}
     assert run(path.parents[2]) == 2
@@ -290,14 +290,14 @@ def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, l
     assert not (tmp_path / "out").exists()
 
 
-def test_unknown_physics_is_refused(tmp_path, capsys):
+def test_unknown_physics_is_rejected(tmp_path, capsys):
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--physics=warp9"]) == 2
     err = capsys.readouterr().err
     assert err.startswith("--physics: expects one of mjx, mujoco, warp, not 'warp9'") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("flag", ["physics", "eval_physics"])
-def test_physics_that_cannot_run_here_is_refused(tmp_path, capsys, monkeypatch, flag):
+def test_physics_that_cannot_run_here_is_rejected(tmp_path, capsys, monkeypatch, flag):
     monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", f"--{flag}=warp"]) == 2
     out, err = capsys.readouterr()
@@ -317,7 +317,7 @@ def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):
+def test_a_folder_that_cannot_be_written_is_rejected(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "file") == 2
     err = capsys.readouterr().err

@@ -140,7 +140,7 @@ def test_json_is_read_up_to_its_limits(tmp_path):
     ],
     ids=lambda content: repr(content)[1:12],
 )
-def test_what_is_no_plain_json_is_refused(tmp_path, content):
+def test_what_is_no_plain_json_is_rejected(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(ValueError):
         files.read_json(tmp_path / "file", 1_000_000)

@@ -1,4 +1,4 @@
-"""From a command line to a run: which one --resume goes on with, and which of its own flags it expects over."""
+"""From a command line to a plan: which run --resume finds, and which output flags it keeps."""
 
 import json
 
@@ -69,7 +69,7 @@ def test_resume_alone_tells_sweeps_apart(tmp_path, sweep):
         plan(tmp_path, "--resume", sweep, "--seeds=9")
 
 
-def test_with_a_name_resume_takes_that_run(tmp_path):
+def test_with_a_name_resume_finds_that_run(tmp_path):
     path = begun(tmp_path, "a")
     begun(tmp_path, "b", started="2026-01-01T00:00:00+00:00")
     made = plan(tmp_path, "--resume", "--name=a")
@@ -82,7 +82,7 @@ def test_with_a_name_that_no_run_has_resume_begins_one(tmp_path):
     assert made.path.name == "b" and made.resumed is None and not made.path.exists()
 
 
-def test_with_the_name_of_a_folder_that_is_no_run_resume_is_refused(tmp_path):
+def test_with_the_name_of_a_folder_that_is_no_run_resume_is_rejected(tmp_path):
     path = tmp_path / "ant" / "sac_sqt" / "a"
     path.mkdir(parents=True)
     (path / "mine").write_text("")
@@ -148,7 +148,7 @@ def test_the_default_checkpoints_fit_the_environments(tmp_path):
         plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--checkpoint_every=20", "--name=a")
 
 
-def test_a_run_that_is_in_the_way_is_refused_unless_it_is_to_be_replaced(tmp_path):
+def test_a_run_that_is_in_the_way_is_rejected_unless_it_is_to_be_replaced(tmp_path):
     path = begun(tmp_path, "a")
     with pytest.raises(flags.UsageError, match="^--name=a: .* expects another name, or --overwrite replaces it$"):
         plan(tmp_path, "--name=a")
@@ -166,7 +166,7 @@ def test_there_is_no_device_without_a_member(tmp_path, monkeypatch):
     assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4
 
 
-def test_devices_that_nobody_named_are_chosen_anew_where_a_run_goes_on(tmp_path, monkeypatch):
+def test_devices_that_nobody_named_are_chosen_again_where_a_run_goes_on(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(jax, "local_devices", lambda: jax.devices()[:1] * 4)
         path = begun(tmp_path, "a")

@@ -1,4 +1,4 @@
-"""A run that is gone on with ends as if it had never stopped."""
+"""A run that is resumed ends as if it had never stopped."""
 
 import itertools
 import json
@@ -124,7 +124,7 @@ def test_a_finished_run_stays_as_it_is(tmp_path, whole):
     assert content().keys() >= before.keys()
 
 
-def test_a_finished_run_is_gone_on_with_for_more_steps(tmp_path):
+def test_a_finished_run_is_resumed_for_more_steps(tmp_path):
     assert run(tmp_path, *MEMBERS) == 0
     path = path_in(tmp_path)
     before = rows_of(path / "evaluations.csv")
@@ -163,11 +163,11 @@ def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize(("reached", "refused"), [(0, False), (50, False), (100, False), (150, True)])
-def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, refused):
+@pytest.mark.parametrize(("reached", "rejected"), [(0, False), (50, False), (100, False), (150, True)])
+def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, rejected):
     """Evaluations every 50 steps, checkpoints every 50: of step 100 the row is there before the second checkpoint."""
     path = write_run(tmp_path, curves=[range(reached // 50 + 1)])
-    if not refused:
+    if not rejected:
         resume.check_may_restart(path, 50)
         return
     with pytest.raises(UsageError) as error:
@@ -236,7 +236,7 @@ def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole
     assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
 
 
-def test_steps_that_cannot_be_are_refused_and_the_run_stays_as_it_was(tmp_path, capsys):
+def test_steps_that_cannot_be_are_rejected_and_the_run_stays_as_it_was(tmp_path, capsys):
     assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert resumed(tmp_path, "--steps=141") == 2

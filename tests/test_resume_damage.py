@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged or hostile: the run goes on from the one before, says so, and ends as it would have."""
+"""Damaged or hostile checkpoints: the run resumes from the one before, prints that, and ends as it would have."""
 
 import csv
 import json
@@ -188,9 +188,7 @@ def contents(path):
     ],
     ids=["no checkpoint is whole", "another format", "the state of another step"],
 )
-def test_a_run_that_cannot_be_gone_on_with_is_refused_and_left_as_it_is(
-    finished, tmp_path, capsys, damage, said, reason
-):
+def test_a_run_that_cannot_be_resumed_is_rejected_and_left_as_it_is(finished, tmp_path, capsys, damage, said, reason):
     path = copied(finished, tmp_path)
     damage(path / "checkpoint")
     before = contents(tmp_path)

@@ -1,4 +1,4 @@
-"""config.json of a run tells what it was, and is read back as that."""
+"""config.json of a run records its settings, and is read back as the same run."""
 
 import json
 from datetime import UTC, datetime
@@ -70,7 +70,7 @@ def test_settings_of_a_run_have_what_is_swept_as_values():
     assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)
 
 
-def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
+def test_every_process_that_resumed_a_run_is_recorded(tmp_path):
     members, swept, content = written(tmp_path, "plain")
     output = content["output"] | {"keep_checkpoints": 5}
     again = run_config.resumed_content(content, 100, content["output"], 40, ["run", "--resume=x"])
@@ -112,7 +112,7 @@ def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_what_describes_no_run_is_refused(tmp_path, change, message):
+def test_what_describes_no_run_is_rejected(tmp_path, change, message):
     _, _, content = written(tmp_path, "swept")
     run_config.write(tmp_path, content | change)
     with pytest.raises(run_config.InvalidRunConfig, match=message) as error:
