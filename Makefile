@@ -15,7 +15,7 @@ run: $(STAMP)  ## SAC with SQT on Ant, five seeds, on a small budget: about thre
 MINI := runs/miniature
 SMALL := --steps=3000 --warmup_steps=1000 --batch_size=128 --eval_every=1000 --eval_episodes=1 --physics=mujoco
 miniature: $(STAMP)  ## the paper's tables 2 to 4 in small: nine algorithms, two tasks, three seeds; report and film
-	$(BIN)/python -m experiments.sweep --preset=all --tasks=cheetah,ant --seeds=0,1,2 $(SMALL) --out=$(MINI)
+	$(BIN)/python -m experiments.sweep --grid=all --tasks=cheetah,ant --seeds=0,1,2 $(SMALL) --out=$(MINI)
 	$(BIN)/python -m experiments.tables $(MINI) --reference --out=$(MINI)/tables --overwrite
 	$(BIN)/python -m experiments.plots $(MINI) --out=$(MINI)/figures --overwrite
 	$(BIN)/python -m experiments.report $(MINI) --reference --out=$(MINI)/report.html --overwrite

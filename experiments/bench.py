@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
     logging.set_verbosity(logging.WARNING)
     environment = compare.peer_environment() if FLAGS.compare else {}
     runtime.prepare()
-    runtime.divide_processor(bench_flags.most_devices())
+    runtime.set_cpu_device_count(bench_flags.most_devices())
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
     print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
     request = bench_flags.request()

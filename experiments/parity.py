@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     if FLAGS.out:
         with exit_on_usage_error():
-            arguments.refuse_file("--out", Path(FLAGS.out), overwrite=True)
+            arguments.reject_file("--out", Path(FLAGS.out), overwrite=True)
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()
     cases = physics_cases(physics_here(), solver_limits())

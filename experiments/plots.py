@@ -46,7 +46,7 @@ def command(argv: Sequence[str]) -> None:
 
     runs = pooling.collect(options.runs)
     draw = figures.all_figures(runs, options.statistic)
-    arguments.refuse_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
+    arguments.reject_existing(options.out, [f"{name}.{options.format}" for name in draw], options.overwrite)
     contents, empty = figures.file_contents(draw, options.format)
     arguments.write_files(options.out, contents)
     for name in contents:

@@ -38,7 +38,7 @@ def parser() -> Parser:
 def command(argv: Sequence[str]) -> None:
     """Raises `UsageError`."""
     options = parser().read(argv)
-    arguments.refuse_file("--out", options.out, options.overwrite)
+    arguments.reject_file("--out", options.out, options.overwrite)
     from experiments.evidence import page, pooling  # imports JAX and matplotlib
 
     runs = pooling.collect(options.runs)

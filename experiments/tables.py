@@ -45,7 +45,7 @@ def command(argv: Sequence[str]) -> None:
 
     runs = pooling.collect(options.runs)
     if options.out:
-        arguments.refuse_existing(options.out, formats.file_names(paper_tables.NAMES), options.overwrite)
+        arguments.reject_existing(options.out, formats.file_names(paper_tables.NAMES), options.overwrite)
     tables = paper_tables.make_tables(runs, options.reference, task_sizes.read_sizes(runs))
     if options.out:
         arguments.write_files(options.out, formats.file_contents(tables))

@@ -42,11 +42,26 @@ def shared_programs() -> Iterator[None]:
 
     For modules that start many runs (`pytestmark = pytest.mark.usefixtures("shared_programs")`).
     """
-    import experiments.run
+    from experiments.running import session
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("make_trainer", "make_sweep"):
-            patch.setattr(experiments.run, name, functools.cache(getattr(experiments.run, name)))
+            patch.setattr(session, name, functools.cache(getattr(session, name)))
+        yield
+
+
+@pytest.fixture(scope="module")
+def tiny_tasks() -> Iterator[None]:
+    """Every task is `probe_envs.constant_reward`: whole runs of `--env=ant` in a second.
+
+    For modules that start many runs (`pytestmark = pytest.mark.usefixtures("tiny_tasks")`).
+    """
+    import probe_envs
+
+    from sqt_jax import envs
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(envs, "make", lambda *_, **__: probe_envs.constant_reward())
         yield
 
 

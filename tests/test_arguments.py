@@ -3,14 +3,14 @@ import argparse
 import pytest
 
 from experiments.commandline import arguments
-from experiments.commandline.arguments import Parser, UsageError, between, folder, guarded, one_of, refuse_file, whole
+from experiments.commandline.arguments import Parser, UsageError, between, folder, guarded, one_of, reject_file
 
 
 @pytest.fixture
 def parser():
     made = Parser("What it does.", "python -m experiments.tables RUNS...")
     made.add_argument("--format", type=one_of("png", "svg"), default="png", metavar="NAME")
-    made.add_argument("--seed", type=whole, default=0, metavar="N")
+    made.add_argument("--seed", type=between(0, 99), default=0, metavar="N")
     made.add_argument("--out", type=folder, metavar="FOLDER")
     made.add_argument("--camera", metavar="NAME")
     made.add_argument("--overwrite", action="store_true")
@@ -32,15 +32,15 @@ def test_runs_and_flags_in_any_order(parser):
         (["a", "--form=svg"], "--form: unknown flag; did you mean --format?"),  # no abbreviations
         (["a", "--format=gif"], "--format: expects one of png, svg, not 'gif'"),
         (["a", "--format"], "--format: expects one of png, svg"),
-        (["a", "--seed", "--overwrite"], "--seed: expects a whole number of at least 0"),
+        (["a", "--seed", "--overwrite"], "--seed: expects a whole number from 0 to 99"),
         (["a", "--out"], "--out: expects a folder"),
         (["a", "--camera"], "--camera: expects a name"),
-        (["a", "--seed=-1"], "--seed: expects a whole number of at least 0, not '-1'"),
+        (["a", "--seed=-1"], "--seed: expects a whole number from 0 to 99, not '-1'"),
         (["a", "--out="], "--out: expects a folder"),
         (["a", "--overwrite=yes"], "--overwrite: is a switch and expects no value"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(parser, argv, message):
+def test_what_cannot_be_is_rejected_in_a_line(parser, argv, message):
     with pytest.raises(UsageError) as error:
         parser.read(["tables", *argv])
     assert str(error.value) == message
@@ -60,11 +60,11 @@ def test_exit_codes(parser, capsys):
 
 def test_files_are_replaced_only_where_that_is_asked_for(tmp_path):
     out = tmp_path / "new" / "tables"
-    arguments.refuse_existing(out, ["a.csv"], overwrite=False)
+    arguments.reject_existing(out, ["a.csv"], overwrite=False)
     arguments.write_files(out, {"a.csv": b"1"})
-    with pytest.raises(UsageError, match="a.csv is there already; expects another folder, or --overwrite replaces it"):
-        arguments.refuse_existing(out, ["b.csv", "a.csv"], overwrite=False)
-    arguments.refuse_existing(out, ["a.csv"], overwrite=True)
+    with pytest.raises(UsageError, match="a.csv already exists; expects another folder, or --overwrite replaces it"):
+        arguments.reject_existing(out, ["b.csv", "a.csv"], overwrite=False)
+    arguments.reject_existing(out, ["a.csv"], overwrite=True)
     arguments.write_files(out, {"a.csv": b"2"})
     assert [(path.name, path.read_bytes()) for path in out.iterdir()] == [("a.csv", b"2")]
 
@@ -73,22 +73,22 @@ def test_folders_that_cannot_be_written(tmp_path):
     file = tmp_path / "file"
     file.write_text("x")
     with pytest.raises(UsageError, match="expects a folder, which this is not"):
-        arguments.refuse_existing(file, ["a.csv"], overwrite=True)
+        arguments.reject_existing(file, ["a.csv"], overwrite=True)
     for out in (file / "below", file / "below" / "further", tmp_path / ("x" * 300)):
         with pytest.raises(UsageError, match="^--out=.*: expects a folder that can be written"):
-            arguments.refuse_existing(out, ["a.csv"], overwrite=True)
+            arguments.reject_existing(out, ["a.csv"], overwrite=True)
         with pytest.raises(UsageError, match="^--out=.*: expects a folder that can be written"):
             arguments.write_files(out, {"a.csv": b""})
     (tmp_path / "a.csv").mkdir()
     with pytest.raises(UsageError, match="a.csv is a folder"):
-        arguments.refuse_existing(tmp_path, ["a.csv"], overwrite=True)
+        arguments.reject_existing(tmp_path, ["a.csv"], overwrite=True)
 
 
 def test_a_link_is_replaced_and_not_written_through(tmp_path):
     (tmp_path / "precious").write_text("x")
     (tmp_path / "a.csv").symlink_to(tmp_path / "precious")
     with pytest.raises(UsageError):
-        arguments.refuse_existing(tmp_path, ["a.csv"], overwrite=False)
+        arguments.reject_existing(tmp_path, ["a.csv"], overwrite=False)
     arguments.write_files(tmp_path, {"a.csv": b"1"})
     assert (tmp_path / "precious").read_text() == "x" and not (tmp_path / "a.csv").is_symlink()
 
@@ -113,7 +113,7 @@ def test_what_is_not_to_be_seen_is_escaped():
     assert arguments.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"
 
 
-def test_a_command_for_one_run_takes_one():
+def test_a_command_for_one_run_expects_one():
     made = Parser("What it does.", "python -m experiments.play RUN --video=FILE", one=True)
     made.add_argument("--seed", type=between(0, 9), metavar="N")
     assert made.prog == "python -m experiments.play"
@@ -129,15 +129,15 @@ def test_a_command_for_one_run_takes_one():
             made.read(["play", "a", f"--seed={text}"])
 
 
-def test_a_file_that_could_not_be_written_is_refused_before(tmp_path):
-    refuse_file("--video", tmp_path / "new" / "folder" / "film.mp4", overwrite=False)
+def test_a_file_that_could_not_be_written_is_rejected_before(tmp_path):
+    reject_file("--video", tmp_path / "new" / "folder" / "film.mp4", overwrite=False)
     (tmp_path / "film.mp4").write_text("x")
     (tmp_path / "link.mp4").symlink_to("nowhere")
     (tmp_path / "folder.mp4").mkdir()
     for name in ("film.mp4", "link.mp4"):
-        refuse_file("--video", tmp_path / name, overwrite=True)
-        with pytest.raises(UsageError, match=f"--video=.*/{name}: is there already; expects another file, or --over"):
-            refuse_file("--video", tmp_path / name, overwrite=False)
+        reject_file("--video", tmp_path / name, overwrite=True)
+        with pytest.raises(UsageError, match=f"--video=.*/{name}: already exists; expects another file, or --over"):
+            reject_file("--video", tmp_path / name, overwrite=False)
     cannot = {
         "folder.mp4": "expects a file, which this folder is not",
         "film.mp4/film.mp4": "expects a file in a folder that can be written",
@@ -145,4 +145,4 @@ def test_a_file_that_could_not_be_written_is_refused_before(tmp_path):
     }
     for name, message in cannot.items():
         with pytest.raises(UsageError, match=message):
-            refuse_file("--video", tmp_path / name, overwrite=True)
+            reject_file("--video", tmp_path / name, overwrite=True)

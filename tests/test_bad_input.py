@@ -1,4 +1,4 @@
-"""What cannot be: one line that names the flag, exit code 2, and nothing is written or changed."""
+"""Invalid input: one line that names the flag, exit code 2, and nothing is written or changed."""
 
 import json
 import os
@@ -8,12 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import probe_envs
 import pytest
 
 from experiments.run import main
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
@@ -23,7 +22,7 @@ RUN = Path("runs/ant/sac_sqt/run")
 
 
 def run(*arguments):
-    return main(["experiments.run", *arguments], env=probe_envs.constant_reward())
+    return main(["experiments.run", *arguments])
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +52,8 @@ def snapshot(path):
     return found
 
 
-def refused(folder, capsys, arguments, begins, expects):
-    """One line that begins and goes on as it should, and nothing else."""
+def rejected(folder, capsys, arguments, begins, expects):
+    """Expects one line with this beginning and rest, and no change to any file."""
     before = snapshot(folder)
     assert run(*arguments) == 2
     out, err = capsys.readouterr()
@@ -130,8 +129,8 @@ def short(value):
 
 
 @pytest.mark.parametrize(("argument", "begins", "expects"), FLAGS, ids=[short(row[0]) for row in FLAGS])
-def test_a_bad_flag_is_refused(folder, capsys, argument, begins, expects):
-    refused(folder, capsys, [*NEW.split(), argument], begins, expects)
+def test_a_bad_flag_is_rejected(folder, capsys, argument, begins, expects):
+    rejected(folder, capsys, [*NEW.split(), argument], begins, expects)
 
 
 # Flags that do not go together
@@ -160,8 +159,8 @@ TOGETHER = [
 
 
 @pytest.mark.parametrize(("arguments", "begins", "expects"), TOGETHER, ids=[row[0] for row in TOGETHER])
-def test_flags_that_cannot_be_together_are_refused(folder, capsys, arguments, begins, expects):
-    refused(folder, capsys, [*NEW.split(), *arguments.split()], begins, expects)
+def test_flags_that_cannot_be_together_are_rejected(folder, capsys, arguments, begins, expects):
+    rejected(folder, capsys, [*NEW.split(), *arguments.split()], begins, expects)
 
 
 # --config=FILE
@@ -198,17 +197,17 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_a_bad_file_of_flags_is_refused(folder, capsys, case):
+def test_a_bad_file_of_flags_is_rejected(folder, capsys, case):
     content, expects = FILES[case]
     (folder / "flags.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
     given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would win
-    refused(folder, capsys, [*given, "--config=flags.yaml"], "--", expects)
+    rejected(folder, capsys, [*given, "--config=flags.yaml"], "--", expects)
 
 
 @pytest.mark.parametrize("path", ["none.yaml", "empty", "/dev/zero", "x" * 300, "fifo", "lön\x07k"])
-def test_what_is_no_file_is_refused(folder, capsys, path):
+def test_what_is_no_file_is_rejected(folder, capsys, path):
     os.mkfifo(folder / "fifo")
-    refused(
+    rejected(
         folder, capsys, [*NEW.split(), f"--config={path}"], "--config=", "expects a file|no such file|cannot be read"
     )
 
@@ -259,8 +258,8 @@ CHANGED = {
     "swept setting": (entries(swept=["hidden"]), "does not describe a run"),
     "swept twice": (entries(swept=["lr", "lr"]), "does not describe a run"),
     "swept without values": (entries(swept=["lr"]), "does not describe a run"),
-    "replay too large": (entries(replay_rows=10**400), "a replay that cannot be"),
-    "replay without rows": (entries(replay_rows=0), "a replay that cannot be"),
+    "replay too large": (entries(replay_rows=10**400), "an invalid replay capacity"),
+    "replay without rows": (entries(replay_rows=0), "an invalid replay capacity"),
     "replay of no size": (entries(replay_rows=None), "does not describe a run"),
     "output that is a list": (entries(output=[]), "does not describe a run"),
     "nan": (entries(device=float("nan")), "does not describe a run"),
@@ -272,13 +271,13 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("case", CHANGED)
-def test_a_run_whose_settings_cannot_be_is_refused(folder, capsys, case):
+def test_a_run_whose_settings_cannot_be_is_rejected(folder, capsys, case):
     change, expects = CHANGED[case]
     config = json.loads((RUN / "config.json").read_text())
     change(config)
     (RUN / "config.json").write_text(json.dumps(config))
     algo = ["--algo=sac_sqt"] if case == "another algorithm" else []
-    refused(folder, capsys, [f"--resume={RUN}", *algo], f"--resume={RUN}:", expects)
+    rejected(folder, capsys, [f"--resume={RUN}", *algo], f"--resume={RUN}:", expects)
 
 
 def replaced_by(content):
@@ -338,11 +337,11 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("case", DAMAGED)
-def test_a_damaged_run_is_refused(folder, capsys, case):
+def test_a_damaged_run_is_rejected(folder, capsys, case):
     damage, expects = DAMAGED[case]
     damage(RUN / "config.json")
     further = ["--steps=160"] if case.startswith("table") else []  # else it is finished, and left as it is
-    refused(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", expects)
+    rejected(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", expects)
 
 
 ITS_OWN = r"expects the run's own settings; these differ: "
@@ -373,9 +372,9 @@ RESUMED = [
 
 
 @pytest.mark.parametrize(("arguments", "begins", "expects"), RESUMED, ids=[short(row[0]) for row in RESUMED])
-def test_a_resume_that_cannot_be_is_refused(folder, capsys, arguments, begins, expects):
+def test_a_resume_that_cannot_be_is_rejected(folder, capsys, arguments, begins, expects):
     text = arguments.replace("RUN", str(RUN)).replace("NEW", NEW)
-    refused(folder, capsys, text.split(" "), begins.replace("RUN", str(RUN)), expects.replace("RUN", str(RUN)))
+    rejected(folder, capsys, text.split(" "), begins.replace("RUN", str(RUN)), expects.replace("RUN", str(RUN)))
 
 
 # --overwrite
@@ -412,14 +411,14 @@ NOT_RUNS = [foreign_file, foreign_folder, a_link_below, a_link_itself, a_link_to
 @pytest.mark.parametrize("change", NOT_RUNS, ids=[change.__name__ for change in NOT_RUNS])
 def test_what_is_not_a_run_alone_is_not_replaced(folder, capsys, change):
     change(RUN)
-    expects = "expects a folder with a run alone"
-    refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", expects)
+    expects = "expects a folder that holds a run and nothing else"
+    rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", expects)
 
 
 def test_a_file_in_a_runs_place_is_not_replaced(folder, capsys):
     shutil.rmtree(RUN)
     RUN.write_text("mine")
-    refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--out=runs:", "expects a folder")
+    rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--out=runs:", "expects a folder")
 
 
 HOLD = """
@@ -431,13 +430,13 @@ with files.locked(pathlib.Path(sys.argv[1])):
 """
 
 
-def test_a_run_at_which_another_process_is_at_work_is_refused(folder, capsys):
+def test_a_run_at_which_another_process_is_at_work_is_rejected(folder, capsys):
     command = [sys.executable, "-c", HOLD, str(RUN.absolute())]
     pipe = subprocess.PIPE
     root = Path(__file__).resolve().parent.parent
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=root) as holder:
         assert holder.stdout.readline() == "locked\n"
-        expects = f"process {holder.pid} is at work on {RUN}; expects another run"
-        refused(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--name=run:", expects)
-        refused(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", expects)
+        expects = f"process {holder.pid} is training {RUN}; expects another run"
+        rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--name=run:", expects)
+        rejected(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", expects)
         holder.stdin.close()

@@ -28,7 +28,7 @@ def run(monkeypatch, tmp_path):
             bench.main(["bench"])
 
     monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
-    monkeypatch.setattr(bench.runtime, "divide_processor", lambda devices: None)
+    monkeypatch.setattr(bench.runtime, "set_cpu_device_count", lambda devices: None)
     cached = jax.config.jax_enable_compilation_cache
     yield main
     jax.config.update("jax_enable_compilation_cache", cached)

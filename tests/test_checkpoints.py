@@ -1,4 +1,4 @@
-"""Checkpoints: exact, written once, whole or not there, and no danger to the run."""
+"""Checkpoints: exact, written once, complete or absent; a failure does not stop the run."""
 
 import errno
 import os
@@ -12,9 +12,9 @@ import pytest
 from test_train import identical, make, start
 
 from experiments.running import checkpoints, files, manifests
-from experiments.running.checkpoints import Checkpoints
+from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
-from experiments.running.manifests import Refused
+from experiments.running.manifests import CannotResume
 from sqt_jax import train
 from sqt_jax.algorithms import ALGORITHMS, replay_of
 from sqt_jax.members import Layout
@@ -45,7 +45,7 @@ class Case:
 
     def store(self, folder, keep=2):
         self.said = []
-        return Checkpoints(folder / "checkpoint", self.replay, self.layout, keep, self.said.append)
+        return CheckpointStore(folder / "checkpoint", self.replay, self.layout, keep, self.said.append)
 
     def saved(self, store, *steps):
         """Saves at these steps of one training; the state at the last of them."""
@@ -160,7 +160,7 @@ def full(*_):
 
 
 def disk_is_full_for_rows(monkeypatch):
-    monkeypatch.setattr(files, "whole_file", full)
+    monkeypatch.setattr(files, "atomic_file", full)
 
 
 def disk_is_full_for_the_state(monkeypatch):
@@ -171,10 +171,10 @@ def disk_is_full_for_the_state(monkeypatch):
 
 
 def disk_is_full_for_the_manifest(monkeypatch):
-    def whole_file(path, original=files.whole_file):
+    def atomic_file(path, original=files.atomic_file):
         return full() if path.name == "manifest.json" else original(path)
 
-    monkeypatch.setattr(files, "whole_file", whole_file)
+    monkeypatch.setattr(files, "atomic_file", atomic_file)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
         store.wait()
     (warning,) = case.said
     assert "no checkpoint at step 70" in warning and "No space left" in warning
-    assert "the one at step 60 is whole" in warning
+    assert "the last valid one is at step 60" in warning
     assert not [name for name in listing(store) if name.endswith(".part")]
     # The older one is as good as before, and with room again there is a newer one.
     state = case.sweep.advance(state, 10, True)
@@ -266,17 +266,17 @@ def test_a_file_that_cannot_be_read_is_no_reason_to_give_a_checkpoint_up(case, t
 
     with monkeypatch.context() as patch:
         patch.setattr(files, "crc", crc)
-        with pytest.raises(Refused, match="cannot be read"):
+        with pytest.raises(CannotResume, match="cannot be read"):
             case.store(tmp_path).restore(case.template)
     assert case.said == [] and listing(store) == before
 
 
-def test_another_format_is_refused_and_kept(case, tmp_path, monkeypatch):
+def test_another_format_is_rejected_and_kept(case, tmp_path, monkeypatch):
     store = case.store(tmp_path)
     case.saved(store, 50, 60)
     before = listing(store)
     monkeypatch.setattr(manifests, "FORMAT", 99)
-    with pytest.raises(Refused, match="are of format '3', not 99"):
+    with pytest.raises(CannotResume, match="are of format '3', not 99"):
         case.store(tmp_path).restore(case.template)
     assert listing(store) == before
 
@@ -316,7 +316,7 @@ def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
     store = case.store(tmp_path)
     case.saved(store, 60)
     other = Case("sac")
-    with pytest.raises(Refused, match="its checkpoints hold another training state than this run's"):
+    with pytest.raises(CannotResume, match="its checkpoints hold another training state than this run's"):
         other.store(tmp_path).restore(other.template)
     assert other.said == [] and identical(case.store(tmp_path).restore(case.template).state, case.trained(60))
 

@@ -8,16 +8,14 @@ import subprocess
 import sys
 
 import numpy as np
-import probe_envs
 import pytest
 
-import experiments.run
 from experiments.run import main
-from experiments.running import records
+from experiments.running import records, session
 from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 
 # The members and sizes that these runs have in common, so that they share compiled programs.
 TINY = (
@@ -28,7 +26,7 @@ SMALL = "--steps=30 --warmup_steps=20 --eval_every=30 --eval_episodes=1 --batch_
 
 
 def run(out, *arguments):
-    return main(["experiments.run", *TINY.split(), f"--out={out}", *arguments], env=probe_envs.constant_reward(5))
+    return main(["experiments.run", *TINY.split(), f"--out={out}", *arguments])
 
 
 def rows_of(path):
@@ -126,7 +124,7 @@ def test_summary_of_a_run(finished):
     assert summary["diverged"] == []
 
 
-def test_a_directory_that_holds_a_run_is_refused(finished, capsys):
+def test_a_directory_that_holds_a_run_is_rejected(finished, capsys):
     path = finished[1]
     before = {item: item.stat().st_mtime_ns for item in path.rglob("*")}
     assert run(path.parents[2]) == 2
@@ -229,32 +227,10 @@ def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsy
     assert json.loads((path / "config.json").read_text())["settings"]["algo"] == "sac_sqt"
 
 
-def test_a_second_signal_ends_the_process_at_once(monkeypatch):
-    codes = []
-    monkeypatch.setattr(experiments.run.os, "_exit", codes.append)
-    with experiments.run._stop_on_signal() as received:
-        signal.raise_signal(signal.SIGTERM)
-        assert received == [signal.SIGTERM] and codes == []
-        signal.raise_signal(signal.SIGINT)
-        assert codes == [130]
-
-
-def test_a_sigterm_that_comes_twice_at_once_is_one(monkeypatch):
-    """By a batch system and by `experiments.sweep`, which passes its own on."""
-    codes, now = [], []
-    monkeypatch.setattr(experiments.run.os, "_exit", codes.append)
-    monkeypatch.setattr(experiments.run.time, "monotonic", lambda: now[-1])
-    with experiments.run._stop_on_signal() as received:
-        for at, left in [(100.0, []), (100.9, []), (102.0, [130])]:
-            now.append(at)
-            signal.raise_signal(signal.SIGTERM)
-            assert received[0] == signal.SIGTERM and codes == left
-
-
 def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
     arguments = TINY.removesuffix(" --name=run").split()
     options = ["--penalty_coef=0,0.5", "--quiet", f"--out={tmp_path}"]
-    assert main(["experiments.run", *arguments, *options], env=probe_envs.constant_reward(5)) == 0
+    assert main(["experiments.run", *arguments, *options]) == 0
     (path,) = (tmp_path / "ant" / "sac_sqt").iterdir()
     assert path.name.startswith("steps=120_warmup_steps=30_batch_size=8_") and "penalty_coef=0.0+0.5" in path.name
     assert path.name[-1] == "Z"
@@ -314,14 +290,14 @@ def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, l
     assert not (tmp_path / "out").exists()
 
 
-def test_unknown_physics_is_refused(tmp_path, capsys):
+def test_unknown_physics_is_rejected(tmp_path, capsys):
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--physics=warp9"]) == 2
     err = capsys.readouterr().err
     assert err.startswith("--physics: expects one of mjx, mujoco, warp, not 'warp9'") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("flag", ["physics", "eval_physics"])
-def test_physics_that_cannot_run_here_is_refused(tmp_path, capsys, monkeypatch, flag):
+def test_physics_that_cannot_run_here_is_rejected(tmp_path, capsys, monkeypatch, flag):
     monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
     assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", f"--{flag}=warp"]) == 2
     out, err = capsys.readouterr()
@@ -335,13 +311,13 @@ def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(experiments.run, "save_policy", full)
+    monkeypatch.setattr(session, "save_policy", full)
     assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 1
     assert "the results cannot be written: " in capsys.readouterr().err
     assert not (tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):
+def test_a_folder_that_cannot_be_written_is_rejected(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "file") == 2
     err = capsys.readouterr().err

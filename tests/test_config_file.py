@@ -1,4 +1,4 @@
-"""A file of settings is the command line that it stands for, or is refused (hostile files: test_bad_input.py)."""
+"""A file of settings is the command line that it stands for, or is rejected (hostile files: test_bad_input.py)."""
 
 import pytest
 
@@ -30,10 +30,10 @@ def test_lines_are_arguments(tmp_path):
         ("steps", "expects lines like `steps: 100000`"),
     ],
 )
-def test_others_are_refused(tmp_path, text, message):
+def test_others_are_rejected(tmp_path, text, message):
     path = tmp_path / "flags.yaml"
     path.write_text(text)
-    with pytest.raises(config_file.Refused) as error:
+    with pytest.raises(config_file.InvalidConfigFile) as error:
         config_file.arguments(path)
     assert str(error.value) == message
 
@@ -43,5 +43,5 @@ def test_no_file(tmp_path):
         (tmp_path / "none", "there is no such file"),
         (tmp_path, "expects a file, which this is not"),
     ):
-        with pytest.raises(config_file.Refused, match=message):
+        with pytest.raises(config_file.InvalidConfigFile, match=message):
             config_file.arguments(path)

@@ -63,7 +63,7 @@ def test_a_lock_that_is_a_link_is_not_written_through(tmp_path):
 def test_a_file_gets_its_name_when_it_is_whole(tmp_path):
     path = tmp_path / "file"
     path.write_text("old")
-    with files.whole_file(path) as file:
+    with files.atomic_file(path) as file:
         file.write(b"new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
@@ -76,7 +76,7 @@ def test_a_file_that_cannot_be_finished_leaves_nothing(tmp_path, error, before):
     path = tmp_path / "file"
     if before:
         path.write_text(before)
-    with pytest.raises(error), files.whole_file(path) as file:
+    with pytest.raises(error), files.atomic_file(path) as file:
         file.write(b"new")
         raise error
     assert {item.name: item.read_text() for item in tmp_path.iterdir()} == ({"file": before} if before else {})
@@ -86,7 +86,7 @@ def test_a_file_that_cannot_be_finished_leaves_nothing(tmp_path, error, before):
 def test_a_link_is_replaced_and_not_written_through(tmp_path, name):
     (tmp_path / "mine").write_text("mine")
     (tmp_path / name).symlink_to(tmp_path / "mine")
-    with files.whole_file(tmp_path / "file") as file:
+    with files.atomic_file(tmp_path / "file") as file:
         file.write(b"new")
     assert (tmp_path / "mine").read_text() == "mine"
     assert (tmp_path / "file").read_text() == "new" and not (tmp_path / "file").is_symlink()
@@ -140,7 +140,7 @@ def test_json_is_read_up_to_its_limits(tmp_path):
     ],
     ids=lambda content: repr(content)[1:12],
 )
-def test_what_is_no_plain_json_is_refused(tmp_path, content):
+def test_what_is_no_plain_json_is_rejected(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(ValueError):
         files.read_json(tmp_path / "file", 1_000_000)

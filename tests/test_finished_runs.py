@@ -79,7 +79,7 @@ def test_a_physics_that_cannot_have_evaluated_is_rejected(tmp_path, value):
     path = write_run(tmp_path)
     content = json.loads((path / "config.json").read_text()) | {"evaluated_on": value}
     (path / "config.json").write_text(json.dumps(content))
-    with pytest.raises(UsageError, match=r"its config.json names a physics that cannot be \(evaluated_on\)"):
+    with pytest.raises(UsageError, match=r"its config.json has an invalid physics \(evaluated_on\)"):
         read_run(path)
 
 

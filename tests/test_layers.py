@@ -32,9 +32,16 @@ LAYERS = [
         "experiments.benchmarks",
         "experiments.gymnasium_parity",
         "experiments.theorem",
+        "experiments.grids",
+        "experiments.running.session",
     },
-    {f"experiments.{command}" for command in ("run", "sweep", "tables", "plots", "play", "tabular", "bench", "soak")},
-    {"experiments.report", "experiments.parity", "experiments.killtest"},  # take parts of other commands
+    {"experiments.run"},
+    {"experiments.endurance"},  # starts runs by their command
+    {
+        f"experiments.{command}"
+        for command in ("sweep", "tables", "plots", "play", "tabular", "bench", "soak", "killtest")
+    },
+    {"experiments.report", "experiments.parity"},  # use parts of other commands
 ]
 PACKAGES = (
     "sqt_jax.agents",
@@ -46,9 +53,16 @@ PACKAGES = (
     "experiments.benchmarks",
     "experiments.gymnasium_parity",
     "experiments.theorem",
+    "experiments.grids",
+    "experiments.endurance",
 )
-# Parts of a package that lie on a lower layer than the rest of it.
-LOWER = {"experiments.running.files", "experiments.running.csv_rows", "experiments.evidence.statistics"}
+# Modules on another layer than the rest of their package.
+OWN_LAYER = {
+    "experiments.running.files",
+    "experiments.running.csv_rows",
+    "experiments.evidence.statistics",
+    "experiments.running.session",  # draws the curves of a finished run
+}
 # Beyond the order of the layers.
 REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
 NETWORKS = ("sqt_jax.networks", "sqt_jax.gaussian", "sqt_jax.sale", "sqt_jax.q_targets")
@@ -105,7 +119,7 @@ def inside(module: str, package: str) -> bool:
 
 def unit(module: str) -> str:
     """The package of the layers that a module belongs to, or itself."""
-    if module in LOWER:
+    if module in OWN_LAYER:
         return module
     return next((package for package in PACKAGES if inside(module, package)), module)
 

@@ -154,7 +154,9 @@ def test_a_member_that_diverges_is_named_once_and_its_later_returns_do_not_count
     recorder = Recorder(TRAIN, breaks_at=800)
     outcome = recorder.run()
     assert outcome.diverged == {1: 800}
-    assert recorder.messages == ["member 1 diverged at step 800: it stays as it was before, the others go on"]
+    assert recorder.messages == [
+        "member 1 diverged at step 800: it is frozen at its last valid state; the others continue"
+    ]
     assert not outcome.interrupted and outcome.env_steps == 2_000
     for report in recorder.reports:
         left_out = report.env_steps >= 1_000

@@ -1,4 +1,4 @@
-"""From a command line to a run: which one --resume goes on with, and which of its own flags it expects over."""
+"""From a command line to a plan: which run --resume finds, and which output flags it keeps."""
 
 import json
 
@@ -10,6 +10,8 @@ from experiments.commandline import flags
 from experiments.running import run_config
 from experiments.running.plan import make_plan
 
+pytestmark = pytest.mark.usefixtures("tiny_tasks")
+
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
     "--batch_size=8 --hidden=8,8"
@@ -18,14 +20,16 @@ NEW = (
 
 def plan(out, *arguments, new=NEW):
     options = flags.parse(["run", *new.split(), *([f"--out={out}"] if new else []), *arguments])
-    return make_plan(options, probe_envs.constant_reward())
+    return make_plan(options)
 
 
-def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", **output):
-    """A run that has written its config.json."""
-    made = plan(out, f"--name={name}", *arguments)
+def begun(out, name, *arguments, started="2025-01-01T00:00:00+00:00", env=None, **output):
+    """A run that has written its config.json; `env` is handed in."""
+    made = own_plan(out, env, f"--name={name}", *arguments) if env else plan(out, f"--name={name}", *arguments)
     made.path.mkdir(parents=True)
-    content = run_config.describe(made.members, made.swept, ["run"], made.options.preset, made.output | output)
+    content = run_config.new_content(
+        made.members, made.swept, ["run"], made.options.preset, made.output | output, made.own_env
+    )
     run_config.write(made.path, content | {"started": started})
     return made.path
 
@@ -65,7 +69,7 @@ def test_resume_alone_tells_sweeps_apart(tmp_path, sweep):
         plan(tmp_path, "--resume", sweep, "--seeds=9")
 
 
-def test_with_a_name_resume_takes_that_run(tmp_path):
+def test_with_a_name_resume_finds_that_run(tmp_path):
     path = begun(tmp_path, "a")
     begun(tmp_path, "b", started="2026-01-01T00:00:00+00:00")
     made = plan(tmp_path, "--resume", "--name=a")
@@ -78,7 +82,7 @@ def test_with_a_name_that_no_run_has_resume_begins_one(tmp_path):
     assert made.path.name == "b" and made.resumed is None and not made.path.exists()
 
 
-def test_with_the_name_of_a_folder_that_is_no_run_resume_is_refused(tmp_path):
+def test_with_the_name_of_a_folder_that_is_no_run_resume_is_rejected(tmp_path):
     path = tmp_path / "ant" / "sac_sqt" / "a"
     path.mkdir(parents=True)
     (path / "mine").write_text("")
@@ -144,7 +148,7 @@ def test_the_default_checkpoints_fit_the_environments(tmp_path):
         plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--checkpoint_every=20", "--name=a")
 
 
-def test_a_run_that_is_in_the_way_is_refused_unless_it_is_to_be_replaced(tmp_path):
+def test_a_run_that_is_in_the_way_is_rejected_unless_it_is_to_be_replaced(tmp_path):
     path = begun(tmp_path, "a")
     with pytest.raises(flags.UsageError, match="^--name=a: .* expects another name, or --overwrite replaces it$"):
         plan(tmp_path, "--name=a")
@@ -162,7 +166,7 @@ def test_there_is_no_device_without_a_member(tmp_path, monkeypatch):
     assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4
 
 
-def test_devices_that_nobody_named_are_chosen_anew_where_a_run_goes_on(tmp_path, monkeypatch):
+def test_devices_that_nobody_named_are_chosen_again_where_a_run_goes_on(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(jax, "local_devices", lambda: jax.devices()[:1] * 4)
         path = begun(tmp_path, "a")
@@ -176,3 +180,59 @@ def test_devices_that_nobody_named_are_chosen_anew_where_a_run_goes_on(tmp_path,
     with pytest.raises(flags.UsageError, match="^--devices=2: expects at most 1 here$"):
         plan(tmp_path, f"--resume={named}", "--devices=2", new="")
     assert len(plan(tmp_path, f"--resume={named}", "--devices=1", new="").layout.devices) == 1
+
+
+# An environment handed in. Needs `make_config` to accept an `Environment`, and `flags.parse(argv, needs_env=False)`.
+
+OWN = NEW.replace("--env=ant ", "")
+
+
+def own_plan(out, env, *arguments, new=OWN):
+    argv = ["run", *new.split(), *([f"--out={out}"] if new else []), *arguments]
+    return make_plan(flags.parse(argv, needs_env=False), env)
+
+
+def point(name="my point", **changes):
+    return probe_envs.constant_reward()._replace(name=name, **changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"), [("point", "point"), ("a/b c:d", "a-b-c-d"), ("v1.5_x-y", "v1.5_x-y"), ("ant", "ant")]
+)
+def test_an_environment_handed_in_names_the_folder(tmp_path, name, folder):
+    made = own_plan(tmp_path, point(name), "--name=a")
+    assert made.path == tmp_path / folder / "sac_sqt" / "a" and made.env is made.own_env
+    assert (made.config.env, made.config.physics, made.config.eval_physics) == (name, "own", "own")
+    assert own_plan(tmp_path, point(name), "--name=a", f"--env={name}").path == made.path
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("", [], "^env: expects an environment with a name that can name a folder, not ''$"),
+        ("..", [], "^env: expects an environment with a name that can name a folder, not '..'$"),
+        ("point", ["--env=ant"], "^--env=ant: expects 'point', the name of the environment handed in, or no --env$"),
+        ("point", ["--physics=mjx"], "^--physics: has no effect with an environment handed in$"),
+        ("point", ["--eval_physics=mjx"], "^--eval_physics: has no effect with an environment handed in$"),
+    ],
+)
+def test_what_contradicts_an_environment_handed_in_is_rejected(tmp_path, name, arguments, message):
+    with pytest.raises(flags.UsageError, match=message):
+        own_plan(tmp_path, point(name), "--name=a", *arguments)
+
+
+def test_own_physics_needs_an_environment_handed_in(tmp_path):
+    with pytest.raises(flags.UsageError, match="^--physics=own: expects an environment handed in: run.main"):
+        plan(tmp_path, "--name=a", "--physics=own")
+
+
+def test_runs_of_the_task_of_that_name_are_told_apart(tmp_path):
+    task = begun(tmp_path, "task")
+    with pytest.raises(flags.UsageError, match="expects no environment handed in; the run was trained on ant"):
+        own_plan(tmp_path, point("ant"), f"--resume={task}", new="")
+    with pytest.raises(flags.UsageError, match="^--resume: there is no run of these settings"):
+        own_plan(tmp_path, point("ant"), "--resume")
+    own = begun(tmp_path, "own", env=point("ant"))
+    assert own_plan(tmp_path, point("ant"), "--resume").path == own and plan(tmp_path, "--resume").path == task
+    with pytest.raises(flags.UsageError, match="these differ: physics .its own: own, now: mjx."):
+        plan(tmp_path, "--resume", "--name=own")

@@ -131,7 +131,7 @@ REJECTED = [
     (f"{RUN} --video=film", "--video: expects a file with the ending"),
     (f"{RUN} --video=", "--video: expects a file with the ending"),
     (f"{RUN} --video=a\0b.mp4", "--video: expects a file, not 'a\\x00b.mp4'"),
-    (f"{RUN} --video=there.mp4", "--video=there.mp4: is there already; expects another file, or --overwrite"),
+    (f"{RUN} --video=there.mp4", "--video=there.mp4: already exists; expects another file, or --overwrite"),
     (f"{RUN} --video=there.mp4/film.mp4", "--video=there.mp4/film.mp4: expects a file in a folder that can be written"),
     (f"{RUN} --size=640", "--size: expects WIDTHxHEIGHT, not '640'"),
     (f"{RUN} --size=641x480", "--size: expects even numbers from 16 to 4096, not '641x480'"),

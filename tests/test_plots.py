@@ -24,7 +24,7 @@ def test_every_figure_is_drawn_and_replaced_only_where_asked(runs, tmp_path, cap
         assert imread(path).std() > 0.05  # not blank
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     assert main(["plots", str(runs), f"--out={out}"]) == 2
-    assert "learning_curves.png is there already" in capsys.readouterr().err
+    assert "learning_curves.png already exists" in capsys.readouterr().err
     assert main(["plots", str(runs), f"--out={out}", "--overwrite"]) == 0
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 

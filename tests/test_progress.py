@@ -10,8 +10,6 @@ from experiments.running.progress import (
     Status,
     TimeLeft,
     counting,
-    evaluation_share,
-    final_table,
     format_seconds,
     time_left,
 )
@@ -44,12 +42,6 @@ def test_evaluations_that_were_never_timed_make_the_time_left_a_lower_bound():
 )
 def test_seconds_as_text(seconds, text):
     assert format_seconds(seconds) == text
-
-
-def test_share_of_evaluation_of_the_full_protocol():
-    text = evaluation_share(1_000_000, 201, 10, 1_000)
-    assert "201 evaluations of 10 episodes" in text
-    assert "up to 2,010,000 steps (67% of all)" in text
 
 
 def test_plain_output_is_a_line_per_evaluation_and_few_others():
@@ -89,26 +81,6 @@ def test_quiet_shows_messages_only(terminal):
         display.evaluated(250, np.array([7.0]))
         display.message("member 3 diverged")
     assert console.file.getvalue() == "member 3 diverged\n"
-
-
-def test_final_table_has_the_members_and_the_groups():
-    member = {"member": 0, "seed": 7, "penalty_coef": 0.5, "final_return": 1.25, "best_return": 2.5, "q_std": 0.125}
-    group = {
-        "penalty_coef": 0.5,
-        "seeds": [7, 8],
-        "final": {"mean": 1.0, "std": 0.25},
-        "score": {"mean": 2.0, "std": 0.5},
-    }
-    lost = member | {"member": 1, "seed": 8, "best_return": None, "q_std": None}
-    summary = {"members": [member, lost], "groups": [group], "diverged": [{"member": 1, "env_steps": 30}]}
-    console = make_console(terminal=False)
-    console.print(final_table(summary, []))
-    rows = [line.split() for line in console.file.getvalue().splitlines() if line.strip()]
-    rows = [row for row in rows if row[0] in ("member", "0", "1", "mean") or set(row[0]) == {"─"}]
-    assert rows[0] == ["member", "seed", "penalty_coef", "final", "return", "best", "return", "q_std"]
-    assert rows[2] == ["0", "7", "0.5", "1.2", "2.5", "0.125"]
-    assert rows[3] == ["1", "(diverged)", "8", "0.5", "1.2", "-", "-"]
-    assert rows[-1] == ["mean", "+-", "std", "2", "seeds", "0.5", "1.0", "+-", "0.2", "2.0", "+-", "0.5"]
 
 
 def test_counting_without_a_terminal_is_a_line_now_and_then():

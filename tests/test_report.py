@@ -44,7 +44,7 @@ def test_it_is_replaced_only_where_asked(runs, tmp_path, capsys):
     out.write_text("mine")
     assert main(["report", str(runs), f"--out={out}"]) == 2
     assert capsys.readouterr().err == (
-        f"--out={out}: is there already; expects another file, or --overwrite replaces it\n"
+        f"--out={out}: already exists; expects another file, or --overwrite replaces it\n"
     )
     assert out.read_text() == "mine"
     assert main(["report", str(runs), f"--out={out}", "--overwrite"]) == 0

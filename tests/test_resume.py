@@ -1,4 +1,4 @@
-"""A run that is gone on with ends as if it had never stopped."""
+"""A run that is resumed ends as if it had never stopped."""
 
 import itertools
 import json
@@ -7,23 +7,19 @@ import shutil
 import signal
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import jax
-import probe_envs
 import pytest
 from made_runs import write_run
 from test_cli import rows_of, run
 
-import experiments.run
 from experiments.commandline.arguments import UsageError
-from experiments.killtest import differences, result_of
+from experiments.endurance.run_results import differences, read_results
 from experiments.run import main
-from experiments.running import checkpoints, loop, records, run_config
-from experiments.running.resume import named
+from experiments.running import checkpoints, loop, records, resume, run_config, session
 from sqt_jax.envs import physics
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 
 MEMBERS = ("--penalty_coef=0,0.5", "--checkpoint_every=20")
 
@@ -32,8 +28,8 @@ def path_in(out):
     return out / "ant" / "sac_sqt" / "run"
 
 
-def resume(out, *arguments):
-    return main(["experiments.run", f"--resume={path_in(out)}", *arguments], env=probe_envs.constant_reward(5))
+def resumed(out, *arguments):
+    return main(["experiments.run", f"--resume={path_in(out)}", *arguments])
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +45,7 @@ def whole(tmp_path_factory):
 def test_a_run_goes_on_on_another_number_of_devices(tmp_path):
     assert run(tmp_path, *MEMBERS, "--steps=80", "--devices=2") == 0
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["devices"] == 2
-    assert resume(tmp_path, "--devices=1", "--steps=120") == 0
+    assert resumed(tmp_path, "--devices=1", "--steps=120") == 0
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["devices"] == 1
     assert {row["env_steps"] for row in rows_of(path_in(tmp_path) / "evaluations.csv")} >= {"0", "80", "120"}
 
@@ -71,7 +67,9 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
     with monkeypatch.context() as patch:
         patch.setattr(records.Records, "report", then(records.Records.report, lambda given: given[0].env_steps))
         patch.setattr(
-            checkpoints.Checkpoints, "save", then(checkpoints.Checkpoints.save, lambda given: given[1].env_steps)
+            checkpoints.CheckpointStore,
+            "save",
+            then(checkpoints.CheckpointStore.save, lambda given: given[1].env_steps),
         )
         assert run(out, *MEMBERS) == 130
     summary = json.loads((path_in(out) / "summary.json").read_text())
@@ -92,9 +90,9 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
 def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, capsys, whole, at, by):
     interrupted(tmp_path, monkeypatch, at, by)
     assert f"--resume={path_in(tmp_path)}" in capsys.readouterr().out
-    assert resume(tmp_path) == 0
-    assert f"going on with it at step {at}" in capsys.readouterr().out
-    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+    assert resumed(tmp_path) == 0
+    assert f"resuming at step {at}" in capsys.readouterr().out
+    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
     summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
     assert (summary["status"], summary["env_steps"]) == ("done", 120)
     seconds = [float(row["wall_seconds"]) for row in rows_of(path_in(tmp_path) / "evaluations.csv")]
@@ -106,9 +104,9 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, ca
 def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_path, monkeypatch, whole):
     interrupted(tmp_path, monkeypatch, 80)
     assert run(tmp_path, *MEMBERS, "--resume") == 0
-    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
     assert run(tmp_path / "new", *MEMBERS, "--resume") == 0
-    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path / "new"))) == []
+    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path / "new"))) == []
 
 
 def test_a_finished_run_stays_as_it_is(tmp_path, whole):
@@ -119,27 +117,27 @@ def test_a_finished_run_stays_as_it_is(tmp_path, whole):
         return {path: path.read_bytes() for path in files}
 
     before = content()
-    assert resume(tmp_path) == 0
+    assert resumed(tmp_path) == 0
     assert content() == before
     shutil.rmtree(path_in(tmp_path) / "policy")  # as after a full disk
-    assert resume(tmp_path) == 0
+    assert resumed(tmp_path) == 0
     assert content().keys() >= before.keys()
 
 
-def test_a_finished_run_is_gone_on_with_for_more_steps(tmp_path):
+def test_a_finished_run_is_resumed_for_more_steps(tmp_path):
     assert run(tmp_path, *MEMBERS) == 0
     path = path_in(tmp_path)
     before = rows_of(path / "evaluations.csv")
-    assert resume(tmp_path, "--steps=200") == 0
+    assert resumed(tmp_path, "--steps=200") == 0
     rows = rows_of(path / "evaluations.csv")
     assert rows[: len(before)] == before
     assert [int(row["env_steps"]) for row in rows[::4]] == [0, 50, 100, 120, 150, 200]
     config = json.loads((path / "config.json").read_text())
     assert (config["settings"]["steps"], config["replay_rows"]) == (200, 120)
-    assert result_of(path)["rows"].shape[1] == 120
-    assert int(result_of(path)["replay/inserted"]) == 200
+    assert read_results(path)["rows"].shape[1] == 120
+    assert int(read_results(path)["replay/inserted"]) == 200
     # And again, with the number of steps that it has by now.
-    assert resume(tmp_path, "--steps=200") == 0
+    assert resumed(tmp_path, "--steps=200") == 0
 
 
 def test_a_diverged_member_stays_so(tmp_path, capsys):
@@ -147,7 +145,7 @@ def test_a_diverged_member_stays_so(tmp_path, capsys):
     first = json.loads((path_in(tmp_path) / "summary.json").read_text())["diverged"]
     assert [entry["member"] for entry in first] == [2, 3]
     capsys.readouterr()
-    assert resume(tmp_path, "--steps=150") == 3
+    assert resumed(tmp_path, "--steps=150") == 3
     summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
     assert summary["diverged"] == first and summary["status"] == "diverged"
     assert "diverged at" not in capsys.readouterr().out  # it is no news
@@ -160,39 +158,38 @@ def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
     assert not (path_in(tmp_path) / "checkpoint").exists()
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     capsys.readouterr()
-    assert resume(tmp_path, "--checkpoint_every=20") == 2
-    assert "expects a run with checkpoints to go on from; it has none" in capsys.readouterr().err
+    assert resumed(tmp_path, "--checkpoint_every=20") == 2
+    assert "expects a run with checkpoints to resume from; it has none" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize(("reached", "refused"), [(0, False), (50, False), (100, False), (150, True)])
-def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, refused):
+@pytest.mark.parametrize(("reached", "rejected"), [(0, False), (50, False), (100, False), (150, True)])
+def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, rejected):
     """Evaluations every 50 steps, checkpoints every 50: of step 100 the row is there before the second checkpoint."""
     path = write_run(tmp_path, curves=[range(reached // 50 + 1)])
-    if not refused:
-        experiments.run._refuse_to_begin_again(path, 50)
+    if not rejected:
+        resume.check_may_restart(path, 50)
         return
     with pytest.raises(UsageError) as error:
-        experiments.run._refuse_to_begin_again(path, 50)
+        resume.check_may_restart(path, 50)
     assert str(error.value) == (
-        f"--resume={path}: expects a run with checkpoints to go on from; it has none, and its evaluations reach step "
-        "150; remove the folder to begin anew"
+        f"--resume={path}: expects a run with checkpoints to resume from; it has none, and its evaluations reach step "
+        "150; remove the folder to start again"
     )
 
 
-def test_tables_of_a_resumed_run_that_cannot_be_written_are_named_by_its_flag(tmp_path, monkeypatch):
+def test_tables_that_cannot_be_written_are_named_by_the_flag_of_their_folder(tmp_path, monkeypatch, capsys):
     def fails(*_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr(records, "Records", fails)
-    options = SimpleNamespace(out="runs")
-    plan = SimpleNamespace(path=tmp_path, resumed=True, options=options, members=[], swept=[])
-    plan.output = {"tensorboard": True}
-    with pytest.raises(UsageError, match=f"^--resume={tmp_path}: expects a folder that can be written: .*Read-only"):
-        experiments.run._tables(plan, None, print)
-    plan.resumed = None
-    with pytest.raises(UsageError, match="^--out=runs: expects a folder that can be written: .*Read-only"):
-        experiments.run._tables(plan, None, print)
+    with monkeypatch.context() as patch:
+        patch.setattr(records, "Records", fails)
+        for _ in range(2):  # a new run, then the one whose config.json it has left
+            again = path_in(tmp_path).exists()
+            assert run(tmp_path, *MEMBERS, *(["--resume"] if again else [])) == 2
+            flag = f"--resume={path_in(tmp_path)}" if again else f"--out={tmp_path}"
+            line = capsys.readouterr().err
+            assert line.startswith(f"{flag}: expects a folder that can be written: ") and "Read-only" in line
 
 
 @pytest.mark.parametrize("where", ["run_config.write", "Records", "train_loop"])
@@ -206,11 +203,11 @@ def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monk
         raise Killed
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        target = {"run_config.write": run_config, "Records": records, "train_loop": experiments.run}[where]
+        target = {"run_config.write": run_config, "Records": records, "train_loop": session}[where]
         patch.setattr(target, where.split(".")[-1], die)
         run(tmp_path, *MEMBERS)
     assert run(tmp_path, *MEMBERS, "--resume") == 0
-    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
 
 
 def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole):
@@ -233,16 +230,16 @@ def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole
         )
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiments.run, "train_loop", stopped)
+        patch.setattr(session, "train_loop", stopped)
         assert run(tmp_path, *MEMBERS) == 130
-    assert resume(tmp_path) == 0
-    assert differences(result_of(path_in(whole)), result_of(path_in(tmp_path))) == []
+    assert resumed(tmp_path) == 0
+    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
 
 
-def test_steps_that_cannot_be_are_refused_and_the_run_stays_as_it_was(tmp_path, capsys):
+def test_steps_that_cannot_be_are_rejected_and_the_run_stays_as_it_was(tmp_path, capsys):
     assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert resume(tmp_path, "--steps=141") == 2
+    assert resumed(tmp_path, "--steps=141") == 2
     assert capsys.readouterr().err.startswith("--steps: expects a multiple of num_envs (2), not 141")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
@@ -255,8 +252,8 @@ def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatc
         seen.append((path_in(tmp_path) / "summary.json").exists())
         return loop.train_loop(*arguments, **options)
 
-    monkeypatch.setattr(experiments.run, "train_loop", looked_at)
-    assert resume(tmp_path, "--steps=140", "--keep_checkpoints=3") == 0
+    monkeypatch.setattr(session, "train_loop", looked_at)
+    assert resumed(tmp_path, "--steps=140", "--keep_checkpoints=3") == 0
     assert seen == [False]
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
 
@@ -267,12 +264,12 @@ def test_a_run_is_evaluated_on_the_physics_that_it_began_with(tmp_path, monkeypa
     content = json.loads((path / "config.json").read_text())
     (path / "config.json").write_text(json.dumps(content | {"evaluated_on": "mjx"}))
     for wanted in ({}, {"eval_physics": "auto"}):  # its own setting is still what it was
-        run = named(path, wanted)
+        run = resume.check(path, resume.read(path), wanted)
         assert {member.config.eval_physics for member in run.members} == {"mjx"}
         assert run.content["settings"]["eval_physics"] == "auto"
     monkeypatch.setitem(physics.LACKS, "mjx", lambda: "a part")
     with pytest.raises(UsageError, match="^--eval_physics: mjx needs a part"):
-        named(path, {})
+        resume.check(path, resume.read(path), {})
 
 
 @pytest.mark.slow
@@ -296,4 +293,4 @@ def test_the_command_resumes_on_every_physics(tmp_path, algo, env, physics):
     whole = train(tmp_path / "whole", "--steps=150", "--replay_capacity=90")
     train(tmp_path / "parts", "--steps=120", "--replay_capacity=90")
     parts = train(tmp_path / "parts", "--steps=150", "--replay_capacity=90", "--resume")
-    assert differences(result_of(whole), result_of(parts)) == []
+    assert differences(read_results(whole), read_results(parts)) == []

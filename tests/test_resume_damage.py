@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged or hostile: the run goes on from the one before, says so, and ends as it would have."""
+"""Damaged or hostile checkpoints: the run resumes from the one before, prints that, and ends as it would have."""
 
 import csv
 import json
@@ -6,11 +6,12 @@ import re
 import shutil
 from pathlib import Path
 
-import probe_envs
 import pytest
 
 from experiments.run import main
 from experiments.running import manifests
+
+pytestmark = pytest.mark.usefixtures("tiny_tasks")
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "
@@ -21,7 +22,7 @@ ROWS = "rows_0000000040_0000000060.bin"
 
 
 def run(*arguments):
-    return main(["experiments.run", *arguments], env=probe_envs.constant_reward())
+    return main(["experiments.run", *arguments])
 
 
 @pytest.fixture(scope="module")
@@ -121,13 +122,13 @@ DAMAGED = {
     "state flipped": (in_state(flipped), "is damaged"),
     "state truncated": (in_state(truncated), "is damaged"),
     "state file missing": (in_state(Path.unlink), "files are missing"),
-    "state with another file": (added, "files are missing or are there too many"),
+    "state with another file": (added, "files are missing, or there are others"),
     "state a link": (moved_out(f"{LAST}/state"), "files are missing"),
     "checkpoint a link": (moved_out(LAST), "it is a link"),
     "rows missing": (in_rows(Path.unlink), f"{ROWS} is missing"),
     "rows truncated": (in_rows(truncated), f"{ROWS} is damaged"),
     "rows flipped": (in_rows(flipped), f"{ROWS} is damaged"),
-    "rows a link": (moved_out(ROWS), f"{ROWS} is missing or is no file"),
+    "rows a link": (moved_out(ROWS), f"{ROWS} is missing or is not a file"),
 }
 
 
@@ -181,22 +182,20 @@ def contents(path):
 @pytest.mark.parametrize(
     ("damage", "said", "reason"),
     [
-        (lambda folder: flipped(min(folder.glob("rows_*"))), 2, "none of its 2 checkpoints is whole"),
+        (lambda folder: flipped(min(folder.glob("rows_*"))), 2, "none of its 2 checkpoints is valid"),
         (manifest(format=lambda _: 99), 0, "its checkpoints are of format '99', not "),
         (of_another_step, 0, "its checkpoint at step 60 is of step 40"),
     ],
     ids=["no checkpoint is whole", "another format", "the state of another step"],
 )
-def test_a_run_that_cannot_be_gone_on_with_is_refused_and_left_as_it_is(
-    finished, tmp_path, capsys, damage, said, reason
-):
+def test_a_run_that_cannot_be_resumed_is_rejected_and_left_as_it_is(finished, tmp_path, capsys, damage, said, reason):
     path = copied(finished, tmp_path)
     damage(path / "checkpoint")
     before = contents(tmp_path)
     assert run(f"--resume={path}", "--steps=80", "--quiet") == 2
     out, err = capsys.readouterr()
     assert len(out.splitlines()) == said and err.count("\n") == 1
-    assert err.startswith(f"--resume={path}: expects a run with checkpoints to go on from; ") and reason in err
+    assert err.startswith(f"--resume={path}: expects a run with checkpoints to resume from; ") and reason in err
     lock = path / "lock"
     assert {item: text for item, text in contents(tmp_path).items() if item != lock} == {
         item: text for item, text in before.items() if item != lock

@@ -1,4 +1,4 @@
-"""config.json of a run tells what it was, and is read back as that."""
+"""config.json of a run records its settings, and is read back as the same run."""
 
 import json
 from datetime import UTC, datetime
@@ -44,7 +44,7 @@ RUNS = {
 
 def written(path, run):
     members, swept = members_of(**RUNS[run])
-    content = run_config.describe(members, swept, ["run", "--x"], "paper", OUTPUT)
+    content = run_config.new_content(members, swept, ["run", "--x"], "paper", OUTPUT)
     run_config.write(path, content)
     return members, swept, content
 
@@ -52,7 +52,7 @@ def written(path, run):
 @pytest.mark.parametrize("run", RUNS)
 def test_a_run_is_read_back_as_it_was_described(tmp_path, run):
     members, swept, content = written(tmp_path, run)
-    assert run_config.read(tmp_path) == run_config.Described(members, swept, json.loads(json.dumps(content)))
+    assert run_config.read(tmp_path) == run_config.RunConfig(members, swept, json.loads(json.dumps(content)))
     assert [item.name for item in tmp_path.iterdir()] == ["config.json"]
 
 
@@ -70,11 +70,11 @@ def test_settings_of_a_run_have_what_is_swept_as_values():
     assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)
 
 
-def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
+def test_every_process_that_resumed_a_run_is_recorded(tmp_path):
     members, swept, content = written(tmp_path, "plain")
     output = content["output"] | {"keep_checkpoints": 5}
-    again = run_config.resumed(content, 100, content["output"], 40, ["run", "--resume=x"])
-    again = run_config.resumed(again, 100, output, 60, ["run", "--resume=y"])
+    again = run_config.resumed_content(content, 100, content["output"], 40, ["run", "--resume=x"])
+    again = run_config.resumed_content(again, 100, output, 60, ["run", "--resume=y"])
     assert again["settings"] == content["settings"] | {"steps": 100} and content["resumed"] == []
     assert [(entry["env_steps"], entry["command"][1]) for entry in again["resumed"]] == [
         (40, "--resume=x"),
@@ -99,11 +99,11 @@ def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
         ({"members": [{"seed": 1}] * 10_001}, "does not describe a run"),
         ({"members": [{"seed": -1, "penalty_coef": 0, "lr": 0.1}]}, "does not describe a run"),
         ({"members": [{"seed": 1.0, "penalty_coef": 0, "lr": 0.1}]}, "does not describe a run"),
-        ({"members": [{"seed": 1, "penalty_coef": 0, "lr": 7}]}, "a setting that cannot be: --lr: expects a number"),
-        ({"members": [{"seed": 1, "penalty_coef": 0, "lr": "x" * 5000}]}, "a setting that cannot be: --lr: expects"),
+        ({"members": [{"seed": 1, "penalty_coef": 0, "lr": 7}]}, "an invalid setting: --lr: expects a number"),
+        ({"members": [{"seed": 1, "penalty_coef": 0, "lr": "x" * 5000}]}, "an invalid setting: --lr: expects"),
         ({"settings": {}}, "does not describe a run"),
-        ({"replay_rows": 61}, "a replay that cannot be"),
-        ({"replay_rows": 7}, "a replay that cannot be"),
+        ({"replay_rows": 61}, "an invalid replay capacity"),
+        ({"replay_rows": 7}, "an invalid replay capacity"),
         ({"replay_rows": "60"}, "does not describe a run"),
         ({"output": None}, "does not describe a run"),
         ({"versions": []}, "does not describe a run"),
@@ -112,10 +112,10 @@ def test_a_run_that_is_gone_on_with_tells_of_every_process(tmp_path):
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_what_describes_no_run_is_refused(tmp_path, change, message):
+def test_what_describes_no_run_is_rejected(tmp_path, change, message):
     _, _, content = written(tmp_path, "swept")
     run_config.write(tmp_path, content | change)
-    with pytest.raises(run_config.NotDescribed, match=message) as error:
+    with pytest.raises(run_config.InvalidRunConfig, match=message) as error:
         run_config.read(tmp_path)
     assert len(str(error.value)) < 500
 

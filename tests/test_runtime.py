@@ -18,7 +18,7 @@ runtime.prepare()
 from experiments.running.plan import make_plan
 print(len(make_plan(flags.parse(["run", *sys.argv[1:]])).layout.devices))
 import jax
-runtime.divide_processor(99)  # too late: without effect, and no error
+runtime.set_cpu_device_count(99)  # too late: without effect, and no error
 print(len(jax.local_devices()))
 """
 

@@ -56,7 +56,7 @@ def test_every_format_is_written_and_replaced_only_where_asked(runs, tmp_path, c
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     (out / "table4.tex").write_text("mine")
     assert main(["tables", str(runs), f"--out={out}"]) == 2
-    assert "table1.txt is there already" in capsys.readouterr().err and (out / "table4.tex").read_text() == "mine"
+    assert "table1.txt already exists" in capsys.readouterr().err and (out / "table4.tex").read_text() == "mine"
     # The same table again, to the last digit: the bootstrap is seeded.
     assert main(["tables", str(runs), f"--out={out}", "--overwrite"]) == 0
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before

@@ -92,7 +92,7 @@ def check_flags() -> None:
         sys.exit(f"--json: expects a file in an existing folder, not {FLAGS.json!r}")
     if "growth" in FLAGS.suites:
         with exit_on_usage_error():
-            arguments.refuse_folder("--figures", Path(FLAGS.figures))
+            arguments.reject_folder("--figures", Path(FLAGS.figures))
     for peer in FLAGS.compare:
         if not {*compare.ALGORITHMS[peer]} & {*FLAGS.algos}:
             sys.exit(f"--algos: expects some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
@@ -138,7 +138,7 @@ def devices_here() -> list[int | None]:
 
 
 def most_devices() -> int:
-    """The largest number of devices that a measurement can use, for `runtime.divide_processor`."""
+    """The largest number of devices that a measurement can use, for `runtime.set_cpu_device_count`."""
     numbers = [int(value) for value in FLAGS.devices if value != "auto"]
     if "auto" in FLAGS.devices or FLAGS.compare:
         numbers += map(int, FLAGS.members)

@@ -98,5 +98,5 @@ def _draw(points: dict[str, dict[int, float]], x_label: str, y_label: str, path:
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
     axes.legend()
-    with files.whole_file(path) as file:
+    with files.atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=150)

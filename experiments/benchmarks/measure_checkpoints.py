@@ -1,4 +1,4 @@
-"""Checkpoints per second: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
+"""CheckpointStore per second: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
 
 import statistics
 import tempfile
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.measurements import Measurement, member_keys
-from experiments.running.checkpoints import Checkpoints
+from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
 from sqt_jax import algorithms, envs, train
 from sqt_jax.members import layout_here
@@ -31,13 +31,13 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     everything, later, waits, size = [], [], [], 0
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
-            store = Checkpoints(Path(folder), replay, layout, 2, print)
+            store = CheckpointStore(Path(folder), replay, layout, 2, print)
             save(store, state, FILLED - NEW)
             waiting, complete = save(store, state, FILLED)
             waits.append(waiting)
             later.append(complete)
         with tempfile.TemporaryDirectory() as folder:
-            everything.append(save(Checkpoints(Path(folder), replay, layout, 2, print), state, FILLED)[1])
+            everything.append(save(CheckpointStore(Path(folder), replay, layout, 2, print), state, FILLED)[1])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
     def measured(what: str, seconds: list[float]) -> Measurement:
@@ -50,7 +50,7 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     yield measured(f"{NEW:,} new rows, until training continues", waits)
 
 
-def save(store: Checkpoints, state: train.TrainState, at: int) -> tuple[float, float]:
+def save(store: CheckpointStore, state: train.TrainState, at: int) -> tuple[float, float]:
     """Saves a checkpoint after `at` steps: the seconds until training can continue, and until it is on disk."""
     began = time.perf_counter()
     store.save(state, Position(at, at), {})

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from experiments.benchmarks.measurements import MEGABYTES, Measurement, member_keys
 from experiments.running import runtime
-from experiments.running.checkpoints import Checkpoints
+from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
 from sqt_jax import algorithms, envs, train
 from sqt_jax.config import Config
@@ -56,7 +56,7 @@ def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str
 
 def _measured(config: Config, members: int) -> Memory:
     runtime.prepare()
-    runtime.divide_processor(members)
+    runtime.set_cpu_device_count(members)
     started = _peak_bytes()
     trainer = algorithms.make_trainer(config)
     replay = algorithms.replay_of(config, envs.make(config.env, config.physics))
@@ -68,7 +68,7 @@ def _measured(config: Config, members: int) -> Memory:
     state = sweep.advance(state, 4, True)
     jax.block_until_ready(sweep.evaluate(state))
     with tempfile.TemporaryDirectory() as folder:
-        store = Checkpoints(Path(folder), replay, layout, 2, print)
+        store = CheckpointStore(Path(folder), replay, layout, 2, print)
         store.save(state, Position(min(SAVED, replay.capacity), 0), {})
         store.wait()
         state = sweep.advance(state, 4, True)

@@ -48,7 +48,7 @@ def save_json(path: Path, measurements: Sequence[Measurement], failures: Sequenc
         "failed": [failure._asdict() for failure in failures],
     }
     try:
-        with files.whole_file(path) as file:
+        with files.atomic_file(path) as file:
             file.write((json.dumps(content, indent=1) + "\n").encode())
     except OSError as error:
         raise UsageError(f"--json={path}: expects a file that can be written: {error.strerror}") from None

@@ -1,6 +1,6 @@
-"""Command lines that look at finished runs: `RUNS...` or one `RUN`, and a few flags, refused in one line.
+"""Command lines of the commands that read finished runs: `RUNS...` or one `RUN`, and a few flags.
 
-Nothing here brings JAX, so that a typing error is answered at once.
+Errors are one line. Nothing here imports JAX, so that a typing error is reported at once.
 """
 
 import argparse
@@ -13,18 +13,19 @@ from typing import Any, NoReturn
 
 from experiments.running import files
 
-DONE, BAD_USAGE = 0, 2
+# Exit codes of all commands.
+DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class UsageError(ValueError):
-    """A command line that cannot be. The text is one line that names the flag or the run."""
+    """An invalid command line. The text is one line that names the flag or the run."""
 
 
 class Parser(argparse.ArgumentParser):
     """argparse with this repository's messages: one line, `--flag: expects ...`.
 
     Args:
-      one: whether it expects the folder of one run, `RUN`, and not any number of `RUNS`.
+      one: whether the command expects the folder of one run, `RUN`, instead of any number of `RUNS`.
     """
 
     def __init__(self, description: str, example: str, one: bool = False):
@@ -40,7 +41,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("runs", nargs="*", metavar=name, help=text)
 
     def read(self, argv: Sequence[str]) -> argparse.Namespace:
-        """The values of `argv`, program name first; leaves with 0 where it asks for help. Raises `UsageError`."""
+        """The values of `argv`, program name first. Exits with 0 after --help. Raises `UsageError`."""
         options, unknown = self.parse_known_intermixed_args(list(argv[1:]))
         if unknown:
             name = unknown[0].partition("=")[0]
@@ -58,14 +59,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         flag, _, rest = message.removeprefix("argument ").partition(": ")
         if "expected one argument" in rest:
-            rest = _takes(next(action for action in self._actions if flag in action.option_strings))
+            rest = _expectation(next(action for action in self._actions if flag in action.option_strings))
         elif "ignored explicit argument" in rest:
             rest = "is a switch and expects no value"
         raise UsageError(f"{flag}: {rest}" if rest else message)
 
 
-def _takes(action: argparse.Action) -> str:
-    """What a flag expects, as its type says of no text at all."""
+def _expectation(action: argparse.Action) -> str:
+    """What a flag expects, taken from the message of its type for an empty text."""
     try:
         if callable(action.type):
             action.type("")
@@ -85,18 +86,11 @@ def one_of(*choices: str) -> Callable[[str], str]:
     return parse
 
 
-def whole(text: str) -> int:
-    """The type of a flag that expects a whole number of at least 0."""
-    if not (text.isascii() and text.isdecimal()):
-        raise argparse.ArgumentTypeError(f"expects a whole number of at least 0, not {text!r}")
-    return int(text)
-
-
 def between(low: int, high: int) -> Callable[[str], int]:
     """The type of a flag that expects a whole number from `low` to `high`."""
 
     def parse(text: str) -> int:
-        # Python refuses to read far more digits than any limit has
+        # int() raises for texts of thousands of digits
         if not (text.isascii() and text.isdecimal() and len(text) < 20 and low <= int(text) <= high):
             raise argparse.ArgumentTypeError(f"expects a whole number from {low} to {high}, not {text[:50]!r}")
         return int(text)
@@ -105,34 +99,34 @@ def between(low: int, high: int) -> Callable[[str], int]:
 
 
 def folder(text: str) -> Path:
-    """The type of a flag that expects a folder, which need not be there."""
+    """The type of a flag that expects a folder, which need not exist."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError("expects a folder")
     return Path(text)
 
 
 def file(text: str) -> Path:
-    """The type of a flag that expects a file, which need not be there."""
+    """The type of a flag that expects a file, which need not exist."""
     if not Path(text).name or text.endswith("/") or "\0" in text:
         raise argparse.ArgumentTypeError("expects a file")
     return Path(text)
 
 
-def refuse_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
-    """Raises `UsageError` where files would be replaced that may not be, or `out` is no folder."""
-    refuse_folder("--out", out)
-    there = [name for name in names if (out / name).exists() or (out / name).is_symlink()]
-    if there and not overwrite:
+def reject_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
+    """Raises `UsageError` if `out` is not a folder, or if files in it would be replaced without --overwrite."""
+    reject_folder("--out", out)
+    existing = [name for name in names if (out / name).exists() or (out / name).is_symlink()]
+    if existing and not overwrite:
         raise UsageError(
-            f"--out={out}: {there[0]} is there already; expects another folder, or --overwrite replaces it"
+            f"--out={out}: {existing[0]} already exists; expects another folder, or --overwrite replaces it"
         )
-    for name in there:
+    for name in existing:
         if (out / name).is_dir():
             raise UsageError(f"--out={out}: {name} is a folder; expects a folder without it")
 
 
-def refuse_folder(flag: str, path: Path) -> None:
-    """Raises `UsageError` where a folder could not be made or written later."""
+def reject_folder(flag: str, path: Path) -> None:
+    """Raises `UsageError` if a folder could not be created or written later."""
     try:
         if path.exists() and not path.is_dir():
             raise UsageError(f"{flag}={path}: expects a folder, which this is not")
@@ -143,32 +137,28 @@ def refuse_folder(flag: str, path: Path) -> None:
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Whether files can be made in a folder, or the folder itself, where it is not there yet."""
+    """Whether files can be created in a folder or, if it does not exist, the folder itself can be created."""
     nearest = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
     return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
 
 
 def write_file(out: Path, content: bytes) -> None:
-    """Writes a whole file, and the folders it lies in. Raises `UsageError` where that cannot be."""
+    """Writes a file, and creates its folders. Raises `UsageError` if that fails."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with files.whole_file(out) as stream:
+        with files.atomic_file(out) as stream:
             stream.write(content)
     except OSError as error:
-        raise _unwritable(out, error) from None
+        raise UsageError(f"--out={out}: expects a file that can be written: {error.strerror}") from None
 
 
-def _unwritable(out: Path, error: OSError) -> UsageError:
-    return UsageError(f"--out={out}: expects a file that can be written: {error.strerror}")
-
-
-def refuse_file(flag: str, path: Path, overwrite: bool) -> None:
-    """Raises `UsageError` where a file could not be written later, or would replace one that it may not."""
+def reject_file(flag: str, path: Path, overwrite: bool) -> None:
+    """Raises `UsageError` if a file could not be written later, or exists and `overwrite` is false."""
     try:
         if path.is_dir():
             raise UsageError(f"{flag}={path}: expects a file, which this folder is not")
         if os.path.lexists(path) and not overwrite:
-            raise UsageError(f"{flag}={path}: is there already; expects another file, or --overwrite replaces it")
+            raise UsageError(f"{flag}={path}: already exists; expects another file, or --overwrite replaces it")
         if not _can_be_written(path.parent):
             raise UsageError(f"{flag}={path}: expects a file in a folder that can be written")
     except OSError as error:  # a name that is too long
@@ -176,23 +166,23 @@ def refuse_file(flag: str, path: Path, overwrite: bool) -> None:
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
-    """Writes whole files into `out`. Raises `UsageError` where that cannot be."""
+    """Writes files into the folder `out`. Raises `UsageError` if that fails."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name, content in contents.items():
-            with files.whole_file(out / name) as file:
+            with files.atomic_file(out / name) as file:
                 file.write(content)
     except OSError as error:
         raise UsageError(f"--out={out}: expects a folder that can be written: {error.strerror}") from None
 
 
 def printable(text: str, kept: str = "") -> str:
-    """With escapes for what is not to be seen, such as control characters and halves of surrogates, but for `kept`."""
+    """`text` with escapes for unprintable characters (control characters, lone surrogates) not in `kept`."""
     return "".join(c if c.isprintable() or c in kept else repr(c)[1:-1] for c in text)
 
 
 def guarded(command: Callable[[Sequence[str]], Any], argv: Sequence[str]) -> int:
-    """Runs a command; the exit code. A `UsageError` is one line on stderr."""
+    """Runs a command and returns its exit code. A `UsageError` becomes one line on stderr."""
     try:
         command(argv)
     except UsageError as error:

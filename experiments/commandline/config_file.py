@@ -1,4 +1,4 @@
-"""A file of settings (`--config=FILE.yaml`), read as the arguments of a command line."""
+"""Reads a YAML file of settings (`--config=FILE.yaml`) as command-line arguments."""
 
 from collections import Counter
 from pathlib import Path
@@ -10,12 +10,12 @@ MAX_BYTES = 100_000
 FOR_THE_COMMAND_LINE = ("config", "help", "resume")
 
 
-class Refused(ValueError):
-    """Why a file cannot be taken, and what can, in one line."""
+class InvalidConfigFile(ValueError):
+    """A file is not a valid file of settings. The text says why, in one line."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML without merge keys (`<<`): a few lines of them can ask for more memory than there is."""
+    """YAML without merge keys (`<<`), since a few lines of them can exhaust the memory."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         pass
@@ -24,7 +24,7 @@ class _Loader(yaml.SafeLoader):
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
         for key, count in keys.items():
             if count > 1:
-                raise Refused(f"expects each setting once, not {key[:50]} {count} times")
+                raise InvalidConfigFile(f"expects each setting once, not {key[:50]} {count} times")
         return super().construct_mapping(node, deep)
 
 
@@ -32,32 +32,32 @@ def arguments(path: Path) -> list[str]:
     """`--name=value` for each line `name: value`; a list of values is joined by commas.
 
     Raises:
-      Refused: there is no such file, or it is not of this kind.
+      InvalidConfigFile: there is no such file, or its content is invalid.
     """
     try:
         if not path.is_file():
-            raise Refused("expects a file, which this is not" if path.exists() else "there is no such file")
+            raise InvalidConfigFile("expects a file, which this is not" if path.exists() else "there is no such file")
         with path.open("rb") as file:
             text = file.read(MAX_BYTES + 1)
         if len(text) > MAX_BYTES:
-            raise Refused(f"expects a file of at most {MAX_BYTES} bytes")
+            raise InvalidConfigFile(f"expects a file of at most {MAX_BYTES} bytes")
         content = yaml.load(text.decode("utf-8"), _Loader)
-    except Refused:
+    except InvalidConfigFile:
         raise
     except OSError as error:
-        raise Refused(f"cannot be read: {error.strerror}") from None
-    # Beside its own errors, PyYAML lets pass what Python says of a date, a number or a tag that cannot be.
+        raise InvalidConfigFile(f"cannot be read: {error.strerror}") from None
+    # In addition to its own errors, PyYAML passes on Python's for an invalid date, number or tag.
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError):
-        raise Refused("expects a YAML file, which this is not") from None
+        raise InvalidConfigFile("expects a YAML file, which this is not") from None
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise Refused("expects lines like `steps: 100000`")
+        raise InvalidConfigFile("expects lines like `steps: 100000`")
     return [_argument(key, value) for key, value in content.items()]
 
 
 def _argument(key: str, value: Any) -> str:
     if key in FOR_THE_COMMAND_LINE:
-        raise Refused(f"{key} is for the command line")
+        raise InvalidConfigFile(f"{key} is for the command line")
     items = value if isinstance(value, list) else [value]
     if not items or not all(isinstance(item, bool | int | float | str) for item in items):
-        raise Refused(f"{key} expects a number, a word or a list of them")
+        raise InvalidConfigFile(f"{key} expects a number, a word or a list of them")
     return f"--{key}={','.join(str(item).lower() if isinstance(item, bool) else str(item) for item in items)}"

@@ -23,11 +23,9 @@ from sqt_jax.suggestions import did_you_mean
 
 MAX_SEED = 2**32 - 1
 MAX_MEMBERS = 10_000
-# What absl understands beside the flags that are defined: another file of flags, and flags that may be unknown.
+# absl understands these in addition to the flags that are defined: a file of flags, and flags that may be unknown.
 ABSL_FLAGS = ("flagfile", "undefok")
-# The run's own flags that a resumed run expects over; the smallest value of each.
-OUTPUT = {"checkpoint_every": 0, "keep_checkpoints": 1, "devices": 1, "tensorboard": False}
-LATEST = "\n"  # no folder's name on a command line
+LATEST = "\n"  # the value of --resume without one: no folder on a command line has this name
 
 
 class Options(NamedTuple):
@@ -109,7 +107,7 @@ def _file_values(name: str) -> dict[str, Any]:
     """The flags of a YAML file, parsed as those of a command line."""
     try:
         arguments = config_file.arguments(Path(name))
-    except config_file.Refused as error:
+    except config_file.InvalidConfigFile as error:
         raise UsageError(f"--config={name}: {error}") from None
     try:
         return _values(["", *arguments])

@@ -5,7 +5,7 @@ import operator
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
-from sqt_jax.config import ConfigError
+from sqt_jax.settings import ConfigError
 
 
 class Row(NamedTuple):

@@ -30,7 +30,7 @@ def read(path: Path) -> RunSettings:
     """
     try:
         run = run_config.read(path)
-    except run_config.NotDescribed as error:
+    except run_config.InvalidRunConfig as error:
         try:
             content = files.read_json(path / run_config.NAME, run_config.MAX_BYTES)
             if content["settings"]["algo"] in ALGORITHMS:

@@ -68,7 +68,7 @@ def write(path: Path, frames: Iterable[np.ndarray], period: float, caption: str 
     Raises as `encode`.
     """
     content = encode(frames, period, format_of(path), caption)
-    with files.whole_file(path) as file:
+    with files.atomic_file(path) as file:
         return file.write(content)
 
 

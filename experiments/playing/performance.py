@@ -77,7 +77,7 @@ def film_episodes(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if is_brax(task.env.name):
-            with files.whole_file(path) as file:
+            with files.atomic_file(path) as file:
                 written = file.write(brax_pages.page(task.scene, [episode.shown for episode in played]))
             print(f"{path}: {written / 1e6:,.2f} MB, for a browser that may fetch Brax's viewer")
             return

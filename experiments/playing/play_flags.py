@@ -73,7 +73,7 @@ def check(run: Path, options: argparse.Namespace) -> None:
             if given:
                 raise UsageError(f"{flag}: has no effect without --video")
         return
-    arguments.refuse_file("--video", options.video, options.overwrite)
+    arguments.reject_file("--video", options.video, options.overwrite)
     if is_brax(name := _env_name(run)):
         if format_of(options.video) != "html":
             raise UsageError(f"--video={options.video}: expects a file with the ending .html, as {name} is Brax's")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import UsageError
 from experiments.running import files, run_config
-from experiments.running.run_config import Described, Member
+from experiments.running.run_config import Member, RunConfig
 from sqt_jax.policy import load_policy
 from sqt_jax.types import Array, Environment
 
@@ -23,11 +23,11 @@ class Chosen(NamedTuple):
     why: str  # the reason of the choice, in words
 
 
-def read(path: Path) -> Described:
+def read(path: Path) -> RunConfig:
     """The run in a folder. Raises `UsageError` if there is none."""
     try:
         return run_config.read(path)
-    except run_config.NotDescribed as error:
+    except run_config.InvalidRunConfig as error:
         raise UsageError(f"{path}: expects the folder of a run; {error}") from None
 
 
@@ -43,7 +43,7 @@ def final_returns(path: Path, count: int) -> list[float]:
     return returns
 
 
-def choose(run: Described, returns: Sequence[float], seed: int | None = None, number: int | None = None) -> Chosen:
+def choose(run: RunConfig, returns: Sequence[float], seed: int | None = None, number: int | None = None) -> Chosen:
     """The member with this number, or the best with this seed, or the best of all.
 
     Args:
@@ -76,7 +76,7 @@ def choose(run: Described, returns: Sequence[float], seed: int | None = None, nu
     return Chosen(best, members[best], why)
 
 
-def caption(run: Described, chosen: Chosen) -> str:
+def caption(run: RunConfig, chosen: Chosen) -> str:
     """One line: algorithm, environment, member, seed, values of the swept settings, and the reason of the choice."""
     config = chosen.member.config
     values = "".join(f", {name} {getattr(config.agent, name):g}" for name in run.swept)

@@ -1,1 +1,1 @@
-"""What one run is made of: its flags, its plan, the loop over chunks, what it says of itself, and going on with it."""
+"""One training run: its plan, its session, the loop over chunks, its files and checkpoints, and resuming it."""

@@ -1,8 +1,8 @@
-"""Checkpoints of a run: all that an exact continuation needs, in the files that `manifests` describes.
+"""A run's checkpoints: everything needed to resume bit for bit, in the files that `manifests` describes.
 
-A checkpoint is the renaming of its finished folder: a process that dies leaves a whole one or none. Rows of the replay
-are immutable, so that a checkpoint writes those alone that came since the last one, straight from the device in pieces;
-the rest is Orbax's.
+A checkpoint's folder gets its name when it is complete: a process that dies leaves a valid checkpoint or none. Replay
+rows never change, so each checkpoint writes only the rows since the last one, from the device in pieces. Orbax writes
+the other arrays.
 """
 
 import shutil
@@ -15,42 +15,43 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint
 
 from experiments.running import files, manifests
 from experiments.running.loop import Position
-from experiments.running.manifests import Manifest, Refused, Rows, Step, Unusable, reaching
+from experiments.running.manifests import CannotResume, DamagedCheckpoint, Manifest, Rows, Step, rows_needed
 from sqt_jax.members import Layout, every_leaf
 from sqt_jax.train import TrainState, member_axes
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Array, Replay, State
 
-PIECE_BYTES = 64_000_000  # of replay rows: what is held on the host at once
+PIECE_BYTES = 64_000_000  # of replay rows on the host at a time
 
 
 class Restored(NamedTuple):
-    """What `save` was given."""
+    """A checkpoint that was read: the arguments of its `CheckpointStore.save`."""
 
     state: TrainState
     position: Position
     lengths: dict[str, int]
 
 
-class Checkpoints:
+class CheckpointStore:
     """Writes and reads the checkpoints of one run.
 
     Args:
       path: the folder, which need not exist.
-      replay: the run's replay, which says where its state keeps its rows.
-      layout: the run's members and where they lie: on disk are theirs alone, whatever the devices.
-      keep: how many checkpoints are kept, the latest ones.
-      warn: expects a line on what went wrong; a checkpoint that cannot be written is no reason to stop training.
+      replay: the run's replay, whose functions get and set the rows of its state.
+      layout: the run's members and their devices. Files hold the members only, so the number of devices may change.
+      keep: the number of checkpoints to keep, the latest ones.
+      warn: called with a line of text when something fails. A checkpoint that cannot be written does not stop training.
     """
 
     def __init__(self, path: Path, replay: Replay, layout: Layout, keep: int, warn: Callable[[str], None]):
         self.path, self.replay, self.layout, self.keep, self.warn = path, replay, layout, keep, warn
-        self._rows: list[Rows] = []  # all that are wanted, in order
-        self._rows_end = 0  # env steps that they reach
-        self._steps: dict[Step, int] = {}  # checkpoints that are wanted, in order -> the step of their last evaluation
+        self._rows: list[Rows] = []  # files to keep, in order
+        self._rows_end = 0  # env steps that they cover
+        self._steps: dict[Step, int] = {}  # checkpoints to keep, in order -> env steps of their last evaluation
         self._writer: threading.Thread | None = None
 
         def rows(state: State, first: Array, count: int) -> Array:
@@ -68,10 +69,10 @@ class Checkpoints:
         self._row_width = jax.eval_shape(lambda: replay.rows(replay.init(), 0, 1)).shape[1]
 
     def save(self, state: TrainState, position: Position, lengths: dict[str, int]) -> None:
-        """Writes the rows, copies the rest, and writes that while training goes on (`wait`).
+        """Writes the rows, copies the other arrays to the host, and writes these in a thread (`wait`).
 
         Args:
-          lengths: how much of the run's tables belongs to this state.
+          lengths: bytes of each of the run's tables at this state.
         """
         self.wait()
         same = [step for step in self._steps if step.env_steps == position.env_steps]
@@ -81,64 +82,64 @@ class Checkpoints:
             self.path.mkdir(exist_ok=True)
             self._write_rows(state.replay, position.env_steps)
         except OSError as error:
-            self._failed(position.env_steps, error)
+            self._warn_of_failure(position.env_steps, error)
             return
         rest = self._without_rows(state)
         own = by_path(every_leaf(member_axes(self.replay), rest))
-        arrays = {name: self._host_copy(leaf, name in own) for name, leaf in _held(rest).items()}
+        arrays = {name: self._host_copy(leaf, name in own) for name, leaf in _non_empty(rest).items()}
         arguments = (Step(position.env_steps, len(same)), arrays, position, lengths)
         self._writer = threading.Thread(target=self._write, args=arguments, daemon=True)
         self._writer.start()
 
     def wait(self) -> None:
-        """Returns when the checkpoint under way is on disk, or has failed."""
+        """Returns when the checkpoint that is being written is on disk, or has failed."""
         if self._writer:
             self._writer.join()
             self._writer = None
 
     def restore(self, template: TrainState) -> Restored | None:
-        """The state of the latest checkpoint that is whole, on the device; None where there is no checkpoint at all.
+        """The latest valid checkpoint, on the device; None if there is no checkpoint at all.
 
-        Those that are not whole are named to `warn`. Nothing is removed (`remove_others`).
+        Damaged checkpoints are reported to `warn`. Nothing is removed (`remove_others`).
 
         Args:
-          template: shapes and types of a state of the run's members alone, as `jax.eval_shape` gives them.
+          template: shapes and dtypes of a state of the run's members without padding, from `jax.eval_shape`.
 
         Raises:
-          Refused: none is whole, or one cannot be read or is of another run.
+          CannotResume: no checkpoint is valid, or one cannot be read or belongs to another run.
         """
-        whole: dict[Step, Manifest] = {}
+        valid: dict[Step, Manifest] = {}
         found = manifests.steps_in(self.path)
         for step in reversed(found):
             try:
                 manifest = manifests.read(self.path, step)
                 manifests.verify(self.path, step, manifest, self.replay.capacity, *self.sizes(template))
-                whole[step] = manifest
-            except Unusable as error:
+                valid[step] = manifest
+            except DamagedCheckpoint as error:
                 self.warn(f"the checkpoint at step {step.env_steps:,} cannot be used: {error}")
-        if not whole:
+        if not valid:
             if found:
-                raise Refused(f"none of its {len(found)} checkpoints is whole")
+                raise CannotResume(f"none of its {len(found)} checkpoints is valid")
             return None
-        whole = dict(list(whole.items())[: self.keep])
-        latest, manifest = next(iter(whole.items()))
+        valid = dict(list(valid.items())[: self.keep])
+        latest, manifest = next(iter(valid.items()))
         state = self._read(latest, manifest, template)
-        self._steps = {step: whole[step].position.evaluated for step in sorted(whole)}
-        self._rows, self._rows_end = sorted({file for each in whole.values() for file in each.rows}), latest.env_steps
+        self._steps = {step: valid[step].position.evaluated for step in sorted(valid)}
+        self._rows, self._rows_end = sorted({file for each in valid.values() for file in each.rows}), latest.env_steps
         return Restored(state, manifest.position, manifest.lengths)
 
     def remove_others(self) -> None:
-        """Removes what belongs to no checkpoint that is wanted: training writes it again, or has no use for it."""
+        """Removes checkpoint files that belong to none of the checkpoints to keep."""
         if not self.path.is_dir():
             return
-        wanted = {step.name for step in self._steps} | {file.name for file in self._rows}
+        kept = {step.name for step in self._steps} | {file.name for file in self._rows}
         for item in self.path.iterdir():
-            if item.name not in wanted and manifests.is_ours(item.name):
+            if item.name not in kept and manifests.is_checkpoint_file(item.name):
                 _remove(item)
 
     def sizes(self, template: TrainState) -> tuple[int, int]:
-        """Bytes of a checkpoint without the replay, and of the replay's rows per env step; `template` as above."""
-        rest = sum(_on_host(leaf).nbytes for leaf in jax.tree.leaves(self._without_rows(template)))
+        """Bytes of a checkpoint without replay rows, and of the rows of one env step; `template` as in `restore`."""
+        rest = sum(_host_template(leaf).nbytes for leaf in jax.tree.leaves(self._without_rows(template)))
         return rest, 4 * self.layout.members * self._row_width
 
     def _write_rows(self, replay: State, stop: int) -> None:
@@ -150,7 +151,7 @@ class Checkpoints:
             count = min(piece, stop - start, capacity - in_ring)
             rows = np.asarray(self._rows_of(replay, jnp.int32(in_ring), count=count))[: self.layout.members].data
             file = Rows(start, start + count, zlib.crc32(rows))
-            with files.whole_file(self.path / file.name) as out:
+            with files.atomic_file(self.path / file.name) as out:
                 out.write(rows)
             self._rows.append(file)
             start = self._rows_end = start + count
@@ -163,48 +164,49 @@ class Checkpoints:
             _orbax().save(part.absolute() / "state", arrays)
             written = files.below(part / "state")
             state = {name: (path.stat().st_size, files.crc(path)) for name, path in written.items()}
-            rows = reaching(self._rows, step.env_steps, capacity)
-            manifests.write(part / "manifest.json", Manifest(state, rows, position, lengths))
+            rows = rows_needed(self._rows, step.env_steps, capacity)
+            manifest = Manifest(state=state, rows=rows, position=position, lengths=lengths)
+            manifests.write(part / "manifest.json", manifest)
             for folder in {path.parent for path in written.values()} | {part}:
-                files.sync(folder)
+                files.sync_folder(folder)
             part.rename(self.path / step.name)
-            files.sync(self.path)
-        except Exception as error:  # Orbax has many: none of them may end the training
+            files.sync_folder(self.path)
+        except Exception as error:  # Orbax raises many types, and none may end the training
             shutil.rmtree(part, ignore_errors=True)
-            self._failed(step.env_steps, error)
+            self._warn_of_failure(step.env_steps, error)
             return
         self._steps = dict([*self._steps.items(), (step, position.evaluated)][-self.keep :])
-        self._rows = reaching(self._rows, next(iter(self._steps)).env_steps, capacity)
+        self._rows = rows_needed(self._rows, next(iter(self._steps)).env_steps, capacity)
         self.remove_others()
 
-    def _failed(self, env_steps: int, error: Exception) -> None:
-        last = f"the one at step {max(self._steps).env_steps:,} is whole" if self._steps else "there is none before it"
+    def _warn_of_failure(self, env_steps: int, error: Exception) -> None:
+        last = f"the last valid one is at step {max(self._steps).env_steps:,}" if self._steps else "there is none yet"
         reason = " ".join(str(error).split())[:200]
-        self.warn(f"no checkpoint at step {env_steps:,} ({reason}); {last}, and the run goes on")
+        self.warn(f"no checkpoint at step {env_steps:,} ({reason}); {last}; training continues")
 
     def _read(self, step: Step, manifest: Manifest, template: TrainState) -> TrainState:
         """The state of a checkpoint whose files have been verified."""
         rest = self._without_rows(template)
-        expected = {name: _on_host(leaf) for name, leaf in _held(rest).items()}
+        expected = {name: _host_template(leaf) for name, leaf in _non_empty(rest).items()}
         folder = (self.path / step.name / "state").absolute()
         try:
-            there = _shapes_on_disk(folder)
-            if there != {name: (leaf.shape, leaf.dtype.name) for name, leaf in expected.items()}:
-                raise Refused("its checkpoints hold another training state than this run's")
+            on_disk = _shapes_on_disk(folder)
+            if on_disk != {name: (leaf.shape, leaf.dtype.name) for name, leaf in expected.items()}:
+                raise CannotResume("its checkpoints hold another training state than this run's")
             arrays = _orbax().restore(folder, expected)
-        except Refused:
+        except CannotResume:
             raise
-        except Exception as error:  # whatever Orbax says of a folder that is not its own
-            raise Refused(f"Orbax cannot read its checkpoint ({type(error).__name__})") from None
+        except Exception as error:  # of any type, if Orbax did not write the folder
+            raise CannotResume(f"Orbax cannot read its checkpoint ({type(error).__name__})") from None
         own = by_path(every_leaf(member_axes(self.replay), template))
         leaves = {
-            # What is not there has no entries, or comes with the rows.
+            # Leaves that are not on disk are empty, or are filled with the rows below.
             name: self._on_devices(arrays.get(name), leaf, name in own)
             for name, leaf in by_path(template).items()
         }
         state = from_paths(template, leaves)
         if int(state.env_steps) != step.env_steps:
-            raise Refused(f"its checkpoint at step {step.env_steps:,} is of step {int(state.env_steps):,}")
+            raise CannotResume(f"its checkpoint at step {step.env_steps:,} is of step {int(state.env_steps):,}")
         replay = state.replay
         for file in manifest.rows:
             rows = np.fromfile(self.path / file.name, np.float32).reshape(self.layout.members, -1, self._row_width)
@@ -213,16 +215,16 @@ class Checkpoints:
 
     def _host_copy(self, leaf: Array, own: bool) -> np.ndarray:
         array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-        # A copy: training goes on in the same memory while it is written.
+        # A copy: training reuses the memory while the file is written.
         return np.array(array[: self.layout.members] if own else array)
 
     def _on_devices(self, array: np.ndarray | None, like: Any, own: bool) -> Array:
-        """`array`, or zeros, of the shape `like` but for the copies of members."""
+        """`array` or zeros on the devices, of the shape of `like` except for the padding of members."""
         sharding = self.layout.sharding(0 if own else None)
         if array is None:
             return jnp.zeros((self.layout.held, *like.shape[1:]) if own else like.shape, like.dtype, device=sharding)
-        there = jax.device_put(self.layout.filled(array) if own else array, sharding)
-        return jax.random.wrap_key_data(there) if _is_key(like) else there
+        placed = jax.device_put(self.layout.filled(array) if own else array, sharding)
+        return jax.random.wrap_key_data(placed) if _is_key(like) else placed
 
     def _without_rows(self, state: TrainState) -> TrainState:
         return state._replace(replay=self.replay.without_rows(state.replay))
@@ -236,8 +238,6 @@ def _remove(path: Path) -> None:
 
 
 def _orbax() -> Any:
-    import orbax.checkpoint  # takes a second: only where a checkpoint is written or read
-
     return orbax.checkpoint.Checkpointer(orbax.checkpoint.StandardCheckpointHandler())
 
 
@@ -246,8 +246,8 @@ def _shapes_on_disk(folder: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     return {name: (tuple(leaf.shape), np.dtype(leaf.dtype).name) for name, leaf in metadata.items()}
 
 
-def _held(state: TrainState) -> dict[str, Any]:
-    """The leaves by name, but for those without entries, such as Brax's environments carry: Orbax refuses them."""
+def _non_empty(state: TrainState) -> dict[str, Any]:
+    """The leaves by name, without empty arrays (Brax's environments have some), which Orbax cannot write."""
     return {name: leaf for name, leaf in by_path(state).items() if leaf.size}
 
 
@@ -255,6 +255,7 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _on_host(leaf: Any) -> np.ndarray:
+def _host_template(leaf: Any) -> np.ndarray:
+    """Zeros of the shape and dtype that a leaf has on disk."""
     shape = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
     return np.zeros(shape.shape, shape.dtype)

@@ -1,7 +1,7 @@
-"""Scalars for TensorBoard, written by the thread that reports them.
+"""Scalars for TensorBoard, written in the calling thread.
 
-tensorboardX's own `SummaryWriter` has a thread and a queue; a full disk ends the thread, and the queue then blocks the
-run.
+tensorboardX's own `SummaryWriter` writes from a queue in a thread. A full disk ends the thread, and the full queue then
+blocks the run.
 """
 
 import os
@@ -15,18 +15,18 @@ from tensorboardX.summary import scalar
 
 
 class Events:
-    """One folder of events, a new file in it.
+    """A new event file in a folder.
 
     Args:
-      purge_step: TensorBoard hides what earlier files say of this step and later ones.
+      purge_step: TensorBoard ignores events of earlier files from this step on.
 
     Raises:
-      OSError: here and later, where nothing can be written.
+      OSError: here and in `add`, if nothing can be written.
     """
 
     def __init__(self, folder: Path, purge_step: int | None = None):
         folder.mkdir(parents=True, exist_ok=True)
-        # The name has the time in seconds: two processes may begin in one.
+        # The file name has the time in seconds, in which two processes may start.
         self._writer = EventsWriter(str(folder / "events"), f".{os.getpid()}")
         if purge_step is not None:
             self._writer.write_event(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))

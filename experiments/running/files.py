@@ -1,4 +1,4 @@
-"""Files that are whole or not there, folders that one process writes, and reading what may be damaged."""
+"""Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
 
 import fcntl
 import json
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-MAX_DEPTH = 20  # of what is read from JSON
+MAX_DEPTH = 20  # of nested JSON
 
 
 class Busy(Exception):
-    """Another process writes in the folder; its number, where it is known."""
+    """Another process has locked the folder; its number, if known."""
 
     def __init__(self, process: str):
         super().__init__(process)
@@ -23,11 +23,11 @@ class Busy(Exception):
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Makes `folder` this process's own; the system gives it back when the process ends, however it ends.
+    """Locks `folder` for this process, by the file `lock` in it. The system unlocks it when the process ends.
 
     Raises:
-      Busy: it is another process's.
-      OSError: the folder or the file `lock` in it cannot be made.
+      Busy: another process has locked it.
+      OSError: the folder or the file `lock` cannot be created.
     """
     folder.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
@@ -44,10 +44,10 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write that gets its name when it is complete and on disk; an older one of that name is replaced."""
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write that gets the name `path` when it is complete and on disk, replacing an existing file."""
     part = path.with_name(path.name + ".part")
-    part.unlink(missing_ok=True)  # a link of that name would be written through
+    part.unlink(missing_ok=True)  # else an existing link would be followed
     try:
         with part.open("xb") as file:
             yield file
@@ -59,8 +59,8 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def sync(folder: Path) -> None:
-    """Returns when the names in a folder are on disk."""
+def sync_folder(folder: Path) -> None:
+    """Returns when the folder's list of names is on disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -78,7 +78,7 @@ def crc(path: Path) -> int:
 
 
 def below(folder: Path) -> dict[str, Path]:
-    """The files below a folder by their path in it. Links are among them, and are not followed: not `folder` either."""
+    """The files below a folder by their path in it. Links are included and not followed; `folder` may not be one."""
     found: dict[str, Path] = {}
     if folder.is_symlink():
         return found
@@ -93,8 +93,8 @@ def read_json(path: Path, limit: int) -> Any:
     """The content of a JSON file of at most `limit` bytes.
 
     Raises:
-      ValueError: it is too large or too deep, or no JSON: NaN and infinity are none, and could not be written again.
-      OSError: it is a link or no file, or cannot be read.
+      ValueError: it is too large, too deep or not JSON, which has no NaN or infinity.
+      OSError: it is a link or not a file, or cannot be read.
     """
     if path.is_symlink() or not path.is_file():
         raise FileNotFoundError(2, "No such file", str(path))
@@ -114,7 +114,7 @@ def read_json(path: Path, limit: int) -> Any:
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text} is no number")
+        raise ValueError(f"{text} is not a finite number")
     return value
 
 

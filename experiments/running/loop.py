@@ -1,7 +1,7 @@
-"""The host loop: chunks of compiled training between evaluations and checkpoints, and what they report.
+"""The host loop: compiled training in chunks, with evaluations, checkpoints and reports in between.
 
-Everything the loop needs is a value: the compiled sweep, a display, a function that expects reports, one that expects
-checkpoints, one that says whether to stop. It writes no files.
+The loop writes no files. The compiled sweep, the display, and the functions that write reports, write checkpoints and
+ask whether to stop are its arguments.
 """
 
 import time
@@ -15,32 +15,32 @@ from experiments.running.progress import Display, Status, TimeLeft, time_left
 from sqt_jax.config import TrainConfig
 from sqt_jax.train import Sweep, TrainState, evaluation_steps, new_interval
 
-# How long one call into the compiled program may take: the display and Ctrl-C wait for it.
+# Length of one call into the compiled program; the display and Ctrl-C wait for it.
 CHUNK_SECONDS = 2.0
 
 
 class Report(NamedTuple):
-    """What the loop knows at an evaluation, or where it was stopped; arrays have the members first."""
+    """Results at an evaluation, or at the step where the loop was stopped. The first axis of arrays is the member."""
 
     env_steps: int
     gradient_steps: int
-    wall_seconds: float  # of training and evaluating, those of an earlier process that this one continues included
-    metrics: dict[str, np.ndarray]  # name -> [S], of the steps since the last report; empty at step 0
-    returns: np.ndarray | None  # [S, episodes]; None where there was no evaluation
+    wall_seconds: float  # since the run's start, without the time between processes
+    metrics: dict[str, np.ndarray]  # name -> [S], over the steps since the last report; empty at step 0
+    returns: np.ndarray | None  # [S, episodes]; None without an evaluation
     lengths: np.ndarray | None  # [S, episodes]
-    bias: dict[str, np.ndarray] = {}  # name -> [S], of `bias.BiasSums`; empty where there was no evaluation
+    bias: dict[str, np.ndarray] = {}  # name of `sqt_jax.bias.NAMES` -> [S]; empty without an evaluation
 
 
 class Position(NamedTuple):
-    """Where a run stands: with the training state, all that the loop needs to go on from there."""
+    """How far a run is. With the training state, this is all that the loop needs to resume."""
 
     env_steps: int = 0
     evaluated: int = -1  # environment steps of the last evaluation
-    diverged: tuple[tuple[int, int], ...] = ()  # (member, environment steps) of those that are known to have
+    diverged: tuple[tuple[int, int], ...] = ()  # (member, environment steps)
     wall_seconds: float = 0.0
 
 
-BEGINNING = Position()
+START = Position()
 
 
 class Outcome(NamedTuple):
@@ -54,21 +54,21 @@ class Outcome(NamedTuple):
 
 
 class Pace:
-    """How long things take, without compilation: the length of the next chunk and the time left follow from it.
+    """Measures speed, without compilation, to choose the length of the next chunk and to estimate the time left.
 
-    Warm-up and learning differ in speed and are timed apart, by the key `learn`.
+    Warm-up and learning differ in speed and are timed separately, by the key `learn`.
     """
 
     def __init__(self) -> None:
         self.compiled = False
-        self.rates: dict[bool, float] = {}  # lockstep steps per second, lately
+        self.rates: dict[bool, float] = {}  # lockstep steps per second, running mean
         self.steps = 0  # lockstep steps timed so far
-        self.train_seconds = 0.0  # that they took
+        self.train_seconds = 0.0  # for these steps
         self.evaluations = 0
-        self.evaluate_seconds = 0.0  # of all but the first, which compiles
+        self.evaluate_seconds = 0.0  # of all except the first, which compiles
 
     def chunk(self, learn: bool, limit: int) -> int:
-        """Lockstep steps for the next call: about `CHUNK_SECONDS`, and one where the call has to compile."""
+        """Lockstep steps of the next call: about `CHUNK_SECONDS`; one if the call has to compile."""
         if not self.compiled:
             return 1
         rate = self.rates.get(learn)
@@ -77,7 +77,7 @@ class Pace:
     def advanced(self, learn: bool, steps: int, seconds: float) -> None:
         if self.compiled:
             rate = steps / max(seconds, 1e-9)
-            self.rates[learn] = 0.7 * self.rates.get(learn, rate) + 0.3 * rate  # steady enough to be read
+            self.rates[learn] = 0.7 * self.rates.get(learn, rate) + 0.3 * rate  # smooth enough to read
             self.steps += steps
             self.train_seconds += seconds
         self.compiled = True
@@ -111,17 +111,19 @@ def train_loop(
     report: Callable[[Report], None],
     display: Display,
     stop: Callable[[], bool],
-    start: Position = BEGINNING,
+    start: Position = START,
     checkpoint_every: int = 0,
     save: Callable[[TrainState, Position], None] = lambda state, position: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Outcome:
-    """Train `state`, which stands at `start`, to `train.steps`: evaluations at step 0, every `eval_every` and the end.
+    """Trains to `train.steps`, with evaluations at step 0, every `eval_every` steps and the end.
 
-    Advances in chunks that end at evaluations, checkpoints and the end of the warm-up. `save` is called every
-    `checkpoint_every` environment steps and at the end (0: never), after an evaluation's report. `stop` is asked
-    between chunks; once it says True, the state is saved, what there is is reported and the loop returns. Of a state
-    with more than `num_members`, the first ones count (`sqt_jax.members`).
+    Args:
+      state: the training state at `start`. Only its first `num_members` members count; the rest is padding.
+      report: called after each evaluation and, if there are steps since the last report, when stopped.
+      stop: asked between chunks. Once it returns True, the state is saved and the loop returns.
+      checkpoint_every: environment steps between calls of `save`, which is also called at the end; 0: never.
+      save: called after the report of an evaluation at the same step.
     """
     began = clock() - start.wall_seconds
     pace = Pace()
@@ -135,7 +137,15 @@ def train_loop(
 
     def show(phase: str, learn: bool) -> None:
         rate = pace.rates[learn] * train.num_envs * num_members if learn in pace.rates else None
-        display.update(Status(phase, done, rate, pace.time_left(done, evaluated, train), last_return))
+        display.update(
+            Status(
+                phase=phase,
+                env_steps=done,
+                steps_per_second=rate,
+                left=pace.time_left(done, evaluated, train),
+                last_return=last_return,
+            )
+        )
 
     def evaluate_and_report() -> None:
         nonlocal last_return, evaluated
@@ -145,7 +155,7 @@ def train_loop(
         returns, lengths = of_members(evaluation.returns), of_members(evaluation.lengths)
         pace.evaluated(clock() - before)
         bad = find_diverged(returns)
-        # The return of the policy that a diverged member is frozen at is not what its algorithm reaches at this step.
+        # A diverged member is frozen: its return is not a result of the algorithm at this step.
         returns = np.where(bad[:, None], np.nan, returns)
         if not bad.all():
             last_return = float(np.nanmean(returns))
@@ -154,30 +164,48 @@ def train_loop(
         display.evaluated(done, returns[~bad].mean(axis=1))
 
     def find_diverged(returns: np.ndarray | None) -> np.ndarray:
-        """[S] bool; members that were not known to be are announced."""
+        """Which members have diverged, [S] bool; prints a message for each new one."""
         since = of_members(state.diverged_at)
-        if returns is not None:  # an environment whose rewards are not finite
+        if returns is not None:  # the environment's rewards may not be finite
             since = np.where((since < 0) & ~np.isfinite(returns).all(axis=1), done, since)
         for member in (int(index) for index in np.flatnonzero(since >= 0)):
             if member not in diverged:
                 diverged[member] = int(since[member])
                 step = f"step {diverged[member]:,}"
-                display.message(f"member {member} diverged at {step}: it stays as it was before, the others go on")
+                display.message(
+                    f"member {member} diverged at {step}: it is frozen at its last valid state; the others continue"
+                )
         return np.isin(np.arange(num_members), list(diverged))
 
     def send(returns: np.ndarray | None, lengths: np.ndarray | None, bias: dict[str, np.ndarray]) -> None:
-        """What the state tells of the interval; nothing before the first step."""
+        """Reports the interval since the last evaluation, which has no metrics before the first step."""
         metrics = {name: of_members(value) for name, value in sweep.measure(state).items()} if done else {}
-        report(Report(done, int(state.gradient_steps), clock() - began, metrics, returns, lengths, bias))
+        report(
+            Report(
+                env_steps=done,
+                gradient_steps=int(state.gradient_steps),
+                wall_seconds=clock() - began,
+                metrics=metrics,
+                returns=returns,
+                lengths=lengths,
+                bias=bias,
+            )
+        )
 
     def save_here() -> None:
         if checkpoint_every:
             show("saving", done >= train.warmup_steps)
-            save(state, Position(done, evaluated, tuple(diverged.items()), clock() - began))
+            position = Position(
+                env_steps=done,
+                evaluated=evaluated,
+                diverged=tuple(diverged.items()),
+                wall_seconds=clock() - began,
+            )
+            save(state, position)
 
     evaluations = {step for step in evaluation_steps(train) if step > evaluated}
     checkpoints = set(checkpoint_steps(checkpoint_every, done, train.steps))
-    if checkpoint_every and evaluations:  # also where the last one alone is left
+    if checkpoint_every and evaluations:  # also if the last evaluation is all that is left
         checkpoints.add(train.steps)
     for point in sorted(evaluations | checkpoints):
         while done < point and not stop():
@@ -206,4 +234,12 @@ def train_loop(
 
     timed = pace.steps * train.num_envs * num_members
     rate = timed / pace.train_seconds if pace.train_seconds else None
-    return Outcome(state, done, interrupted, diverged, clock() - began, pace.train_seconds, rate)
+    return Outcome(
+        state=state,
+        env_steps=done,
+        interrupted=interrupted,
+        diverged=diverged,
+        wall_seconds=clock() - began,
+        train_seconds=pace.train_seconds,
+        steps_per_second=rate,
+    )

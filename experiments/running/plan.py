@@ -1,4 +1,4 @@
-"""From a command line to a run that can begin: what is trained, where, and whether it can be."""
+"""From a command line to a plan: what is trained and where, checked before anything is written or compiled."""
 
 import dataclasses
 import re
@@ -14,31 +14,31 @@ from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.presets import preset_settings
 from experiments.running import records, resume, run_config, runtime
-from experiments.running.run_config import Described, Member
+from experiments.running.run_config import Member, RunConfig
 from sqt_jax import envs
-from sqt_jax.algorithms import check_physics, make_config, memory_estimate
-from sqt_jax.config import Config, ConfigError, TrainConfig
+from sqt_jax.algorithms import OWN_PHYSICS, check_physics, make_config, memory_estimate
+from sqt_jax.config import Config, TrainConfig
 from sqt_jax.members import Layout, usable_devices
-from sqt_jax.settings import settings_of
+from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Environment
 
 
 class Plan(NamedTuple):
-    """A checked command line: everything a run needs, before anything is written or compiled."""
+    """Everything a run needs to start or resume."""
 
     members: list[Member]
-    swept: list[str]
+    swept: list[str]  # names of the swept settings
     path: Path
-    resumed: Described | None  # the run to go on with; None is a new one
-    output: dict[str, Any]  # the values of `flags.OUTPUT`
+    resumed: RunConfig | None  # the run to resume; None: a new one
+    output: dict[str, Any]  # the fields of `OutputConfig`
     layout: Layout
     env: Environment
-    own_env: Environment | None  # which expects the place of the named one
+    own_env: Environment | None  # `env`, if it was handed in
     options: flags.Options
 
     @property
     def config(self) -> Config:
-        """The first member's: all share everything but the swept scalars."""
+        """The first member's: all members have the same settings except the swept ones."""
         return self.members[0].config
 
     @property
@@ -46,93 +46,149 @@ class Plan(NamedTuple):
         return self.config.train
 
 
-def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
-    """What a command line asks for; `env` expects the place of the environment that it names.
+class _Target(NamedTuple):
+    """Which run a command line means."""
 
-    Raises `UsageError` for settings that cannot be, a directory that is taken and too little memory.
+    members: list[Member]
+    swept: list[str]
+    path: Path
+    resumed: RunConfig | None
+
+
+def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
+    """The plan of a command line.
+
+    Args:
+      env: an environment handed in. The run is filed and recorded under its name; `options.env` need not be given.
+
+    Raises:
+      UsageError: invalid settings, an existing run of the same name, nothing to resume, or too little memory.
     """
-    members, swept, path, run = _named(options) if options.resume in (None, flags.LATEST) else _resumed(options)
-    if run is None:
+    _check_env(options, env)
+    folder_given = options.resume not in (None, flags.LATEST)
+    target = _from_folder(options, env) if folder_given else _from_settings(options, env)
+    if target.resumed is None:
         try:
             if options.overwrite:
-                records.run_alone(path)
-            elif records.is_taken(path):
-                raise UsageError(taken(path))
+                records.removable_files(target.path)
+            elif records.is_taken(target.path):
+                raise name_taken(target.path)
         except records.NotARun:
-            raise UsageError(not_a_run(path)) from None
+            raise not_only_a_run(target.path) from None
         except OSError as error:
             raise UsageError(f"--out={options.out}: expects a folder that can be read: {error}") from None
-    config = members[0].config
-    own_env = env
+    config, count = target.members[0].config, len(target.members)
     try:
-        env = own_env or envs.make(config.env, config.physics)
+        used_env = env or envs.make(config.env, config.physics)
     except ValueError as error:
         raise UsageError(f"--physics: {error}") from None
-    output = _output(options, run, config.train)
-    layout = _layout(len(members), output["devices"], typed=options.devices is not None)
-    needed, free = memory_estimate(config, layout.held, env), _free_memory(len(layout.devices))
+    output = _output(options, target.resumed, config.train)
+    layout = _layout(count, output["devices"], typed=options.devices is not None)
+    needed, free = memory_estimate(config, layout.held, used_env), _free_memory(len(layout.devices))
     if needed > free:
         raise UsageError(
-            f"--replay_capacity={config.train.replay_capacity}: {len(members)} members need about "
+            f"--replay_capacity={config.train.replay_capacity}: {count} members need about "
             f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; expects a smaller number, or fewer --seeds"
         )
-    return Plan(members, swept, path, run, output, layout, env, own_env, options)
+    return Plan(
+        members=target.members,
+        swept=target.swept,
+        path=target.path,
+        resumed=target.resumed,
+        output=output,
+        layout=layout,
+        env=used_env,
+        own_env=env,
+        options=options,
+    )
 
 
-def _named(options: flags.Options) -> tuple[list[Member], list[str], Path, Described | None]:
-    """Members and folder of the run that the settings name: a new one, or with --resume the one that is there."""
-    assert options.algo and options.env and options.seeds is not None
+def _check_env(options: flags.Options, env: Environment | None) -> None:
+    """Flags that contradict an environment handed in, or that need one."""
+    for flag in ("physics", "eval_physics"):
+        if env is not None and flag in options.settings:
+            raise UsageError(f"--{flag}: has no effect with an environment handed in")
+        if options.settings.get(flag) == OWN_PHYSICS:
+            raise UsageError(f"--{flag}={OWN_PHYSICS}: expects an environment handed in: run.main(argv, env=...)")
+    if env is None:
+        return
+    if options.env not in (None, env.name):
+        raise UsageError(
+            f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
+        )
+    if not _folder_name(env.name).strip("."):
+        raise UsageError(f"env: expects an environment with a name that can name a folder, not {env.name!r}")
+
+
+def _folder_name(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]", "-", name)
+
+
+def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
+    """A new run with these settings, or with --resume an existing one."""
+    named_env = env or options.env
+    assert options.algo and named_env and options.seeds is not None
     preset: dict[str, Any] = {}
     try:
-        default = make_config(options.algo, options.env)
+        default = make_config(options.algo, named_env)
         preset = preset_settings(options.preset, default.algo, default.env)
         settings = preset | options.settings
         configs = [
-            make_config(options.algo, options.env, **settings | dict(zip(options.sweep, values, strict=True)))
+            make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
-        runtime.divide_processor(options.devices or len(configs) * len(options.seeds))  # what follows starts JAX
-        check_physics(configs[0])
+        runtime.set_cpu_device_count(options.devices or len(configs) * len(options.seeds))  # before JAX starts
+        if env is None:
+            check_physics(configs[0])
     except ConfigError as error:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
         raise UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
     members, swept = run_config.make_members(options.seeds, configs), list(options.sweep)
-    folder = Path(options.out) / default.env / default.algo
+    folder = Path(options.out) / (_folder_name(env.name) if env else default.env) / default.algo
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
-        return members, swept, path, None
-    wanted = run_config.settings_of(members, swept)
+        return _Target(members=members, swept=swept, path=path, resumed=None)
+    wanted = run_config.settings_of(members, swept) | run_config.sizes_of(env)
     if options.name is None:
         path, run = resume.latest(folder, wanted)
     elif not _exists(path / run_config.NAME):
-        return members, swept, path, None  # so that one command starts a run and goes on with it
+        # A new run: one command both starts a run and resumes it.
+        return _Target(members=members, swept=swept, path=path, resumed=None)
     else:
-        run = resume.named(path, wanted, options.devices)
-    return resume.with_its_replay(run), run.swept, path, run
+        run = resume.check(path, resume.read(path), wanted, options.devices)
+    return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
-def _resumed(options: flags.Options) -> tuple[list[Member], list[str], Path, Described]:
-    """Members and folder of the run in --resume=DIR, which the other flags may repeat."""
+def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
+    """The run in --resume=DIR, whose settings the other flags may repeat."""
     assert options.resume
     path = Path(options.resume)
     wanted: dict[str, Any] = options.settings | options.sweep
     wanted |= {"algo": options.algo} if options.algo else {}
     wanted |= {"seeds": options.seeds} if options.seeds is not None else {}
-    if options.env:
+    run = resume.read(path)
+    name = run.members[0].config.env
+    if env is not None:
+        if not run.on_own_env:
+            raise UsageError(f"--resume={path}: expects no environment handed in; the run was trained on {name}")
+        wanted |= {"env": env.name} | run_config.sizes_of(env)
+    elif run.on_own_env:
+        raise UsageError(f"--resume={path}: expects the environment {name!r} handed in: run.main(argv, env=...)")
+    elif options.env:
         try:
             wanted["env"] = envs.resolve(options.env)
         except ValueError as error:
             raise UsageError(f"--env: {error}") from None
-    run = resume.named(path, wanted, options.devices)
-    return resume.with_its_replay(run), run.swept, path, run
+    run = resume.check(path, run, wanted, options.devices)
+    return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
-def _output(options: flags.Options, run: Described | None, train: TrainConfig) -> dict[str, Any]:
-    """The run's own flags: as given, as the resumed run has them, or the defaults."""
+def _output(options: flags.Options, run: RunConfig | None, train: TrainConfig) -> dict[str, Any]:
+    """The fields of `OutputConfig`: as given, as in the resumed run's config.json, or the defaults."""
     output: dict[str, Any] = dataclasses.asdict(flag_table.OutputConfig())
     if run:
         kept = {name: run.content["output"].get(name) for name in output}
-        output |= {name: value for name, value in kept.items() if _may_be(name, value)}
+        output |= {name: value for name, value in kept.items() if _is_valid_output(name, value)}
     output |= {name: getattr(options, name) for name in output if getattr(options, name) is not None}
     if options.checkpoint_every is None:  # the default may not be a multiple
         output["checkpoint_every"] -= output["checkpoint_every"] % train.num_envs
@@ -144,7 +200,11 @@ def _output(options: flags.Options, run: Described | None, train: TrainConfig) -
 
 
 def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
-    """Where the members lie, by --devices; None is chosen here, anew whenever a run goes on: it may do so elsewhere."""
+    """The devices that the members are spread over: --devices, or as many as this machine can use.
+
+    Args:
+      typed: whether --devices was given now; else `devices` is the resumed run's.
+    """
     here = jax.local_devices()
     count = devices or usable_devices(num_members)
     if count > len(here):
@@ -170,7 +230,8 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _may_be(name: str, value: Any) -> bool:
+def _is_valid_output(name: str, value: Any) -> bool:
+    """Whether a value from config.json is one that the flag accepts."""
     try:
         settings_of(flag_table.OutputConfig)[name].check(value)
     except ConfigError:
@@ -178,16 +239,20 @@ def _may_be(name: str, value: Any) -> bool:
     return True
 
 
-def not_a_run(path: Path) -> str:
-    return f"--overwrite: {path} holds other things than a run; expects a folder with a run alone"
+def not_only_a_run(path: Path) -> UsageError:
+    return UsageError(
+        f"--overwrite: {path} holds other things than a run; expects a folder that holds a run and nothing else"
+    )
 
 
-def taken(path: Path) -> str:
-    return f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
+def name_taken(path: Path) -> UsageError:
+    return UsageError(
+        f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
+    )
 
 
 def _free_memory(devices: int) -> int:
-    """Bytes that a run may take: the accelerators', or the machine's or its container's that are free."""
+    """Bytes available to a run: of the accelerators, or of the machine's memory and its container's limit."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))

@@ -1,24 +1,22 @@
-"""What a run shows: a live line on a terminal, plain lines elsewhere, nothing with --quiet; a table at the end."""
+"""Progress of a run: a live line on a terminal, plain lines elsewhere, nothing with --quiet."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
-# Without a terminal there is at most one line in so many seconds, besides one per evaluation.
+# Seconds between lines without a terminal, in addition to one line per evaluation.
 PLAIN_SECONDS = 10.0
 
 
 class TimeLeft(NamedTuple):
     seconds: float
-    at_least: bool = False  # evaluations are still to come, and how long they take is not known yet
+    at_least: bool = False  # evaluations are left and none has been timed yet
 
     def __str__(self) -> str:
         return f"{'> ' if self.at_least else ''}{format_seconds(self.seconds)}"
@@ -28,7 +26,7 @@ class Status(NamedTuple):
     phase: str
     env_steps: int  # of one member
     steps_per_second: float | None  # environment steps of all members together; None: not measured yet
-    left: TimeLeft | None  # None: cannot be told yet
+    left: TimeLeft | None  # None: not known yet
     last_return: float | None  # mean over members and episodes of the last evaluation
 
 
@@ -38,10 +36,10 @@ def time_left(
     evaluations_left: int,
     seconds_per_evaluation: float | None,
 ) -> TimeLeft | None:
-    """Until the end of a run, or None while steps are to come of a kind that has not been timed.
+    """Time until the end of a run; None if warm-up or learning steps are left that have not been timed yet.
 
-    `steps_left` and `steps_per_second` are one member's, keyed by whether the steps learn. Evaluations that were not
-    timed are left out, which the result says: the second one comes late in a run, or late after it was resumed.
+    `steps_left` and `steps_per_second` are one member's, keyed by whether the steps learn. Before an evaluation has
+    been timed, the result is a lower bound without evaluations.
     """
     seconds = 0.0
     for learn, steps in steps_left.items():
@@ -104,7 +102,7 @@ class Display:
             self._bar.stop()
 
     def update(self, status: Status) -> None:
-        """Show where the run is; called as often as one likes."""
+        """Shows how far the run is. May be called at any rate."""
         fields = _fields(status)
         if self._bar:
             self._bar.update(self._task, description=status.phase, completed=status.env_steps, **fields)
@@ -119,13 +117,13 @@ class Display:
         self._last_phase = status.phase
 
     def evaluated(self, env_steps: int, returns: np.ndarray) -> None:
-        """One line per evaluation. `returns`: mean return of each member that has not diverged."""
+        """Prints a line for an evaluation. `returns`: mean return of each member that has not diverged."""
         if not self.quiet and len(returns):
             spread = f" +- {returns.std():,.1f} over {len(returns)} members" if len(returns) > 1 else ""
             self._line(f"step {env_steps:>9,}: return {returns.mean():,.1f}{spread}")
 
     def message(self, text: str) -> None:
-        """A line that is shown even with --quiet."""
+        """Prints a line, even with --quiet."""
         self._line(text)
 
     def _line(self, text: str) -> None:
@@ -137,9 +135,9 @@ class Display:
 def counting(
     what: str, total: int, console: Console, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[int], None]]:
-    """Shows how much of `total` is done and how long the rest expects; gives the function that is told what is done.
+    """Shows how much of `total` is done and the time left; yields the function to call with the amount done.
 
-    On a terminal a live line that goes when all is done, elsewhere a line every `PLAIN_SECONDS`.
+    On a terminal this is a live line, removed at the end; elsewhere a line every `PLAIN_SECONDS`.
     """
     if console.is_terminal:
         columns = (TextColumn(what), BarColumn(), TextColumn("{task.completed:,}/{task.total:,}  left"))
@@ -149,7 +147,7 @@ def counting(
         return
     start = last = clock()
 
-    def tell(done: int) -> None:
+    def update(done: int) -> None:
         nonlocal last
         now = clock()
         if now - last >= PLAIN_SECONDS and 0 < done < total:
@@ -158,52 +156,4 @@ def counting(
             line = f"{what}: {done:,} of {total:,}, left {left}"
             console.print(line, highlight=False, markup=False, soft_wrap=True)
 
-    yield tell
-
-
-def evaluation_share(steps: int, evaluations: int, episodes: int, episode_length: int) -> str:
-    """How much of a run is evaluation, said before it starts. Steps and episodes are one member's."""
-    evaluated = evaluations * episodes * episode_length
-    share = evaluated / (evaluated + steps)
-    return (
-        f"per member: {steps:,} training steps; {evaluations:,} evaluations of {episodes:,} episodes, up to "
-        f"{evaluated:,} steps ({share:.0%} of all)"
-    )
-
-
-def final_table(summary: Mapping[str, Any], swept: Sequence[str]) -> Table:
-    """The members of a finished run and, below, the score of each group; from what `records.summarise` gives."""
-
-    def number(value: float | None, digits: int = 1) -> str:
-        return "-" if value is None else f"{value:,.{digits}f}"
-
-    columns = ["penalty_coef", *swept]
-    table = Table(
-        box=SIMPLE_HEAD,
-        show_footer=False,
-        caption="last rows: the mean over seeds, at the end and at its best evaluation (the paper's score)",
-    )
-    for name in ("member", "seed", *columns, "final return", "best return", "q_std"):
-        table.add_column(name, justify="right")
-    diverged = {entry["member"]: entry["env_steps"] for entry in summary["diverged"]}
-    for member in summary["members"]:
-        table.add_row(
-            str(member["member"]) + (" (diverged)" if member["member"] in diverged else ""),
-            str(member["seed"]),
-            *(f"{member[name]:g}" for name in columns),
-            number(member["final_return"]),
-            number(member["best_return"]),
-            number(member["q_std"], 3),
-        )
-    table.add_section()
-    for group in summary["groups"]:
-        final, score = group["final"], group["score"]
-        table.add_row(
-            "mean +- std",
-            f"{len(group['seeds'])} seeds",
-            *(f"{group[name]:g}" for name in columns),
-            f"{number(final['mean'])} +- {number(final['std'])}",
-            f"{number(score['mean'])} +- {number(score['std'])}",
-            "",
-        )
-    return table
+    yield update

@@ -1,4 +1,4 @@
-"""What a run leaves in `<out>/<env>/<algo>/<name>/`: tables, a summary, events for TensorBoard."""
+"""The files of a run in `<out>/<env>/<algo>/<name>/`: tables, a summary, TensorBoard events."""
 
 import contextlib
 import csv
@@ -13,13 +13,13 @@ import numpy as np
 
 from experiments.evidence.statistics import iqm, score
 from experiments.running import files
-from experiments.running.csv_rows import Shortened, Table
+from experiments.running.csv_rows import CsvTable, MissingRows
 from experiments.running.events import Events
 from experiments.running.loop import Outcome, Report
 from experiments.running.run_config import Member
 from sqt_jax import bias
 
-# The columns that every evaluations.csv has; further swept scalars follow.
+# The columns of every evaluations.csv; swept settings other than penalty_coef follow.
 EVALUATION_COLUMNS = (
     "member",
     "env_steps",
@@ -37,10 +37,10 @@ EVALUATION_COLUMNS = (
 
 
 class NotARun(Exception):
-    """The directory holds something else than a run."""
+    """The folder holds other things than a run."""
 
 
-# What a run leaves: nothing else is ever removed.
+# The files and folders of a run: no others are ever removed.
 RUN_FILES = (
     "config.json",
     "config.json.part",
@@ -51,21 +51,21 @@ RUN_FILES = (
     "curves.png",
 )
 RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "tensorboard")
-# What a run that died before it began may have left.
+# Left by a run that died before it wrote its config.json.
 LEFTOVERS = {"lock", "config.json.part"}
 
 
 def is_taken(path: Path) -> bool:
-    """Whether there is anything in `path` that a new run would mix with."""
+    """Whether `path` has files that a new run would be mixed with."""
     return path.is_dir() and any(item.name not in LEFTOVERS for item in path.iterdir())
 
 
-def run_alone(path: Path) -> set[str]:
-    """The names in `path` that `remove_run` may remove.
+def removable_files(path: Path) -> set[str]:
+    """The names in `path` that `remove_run` would remove.
 
     Raises:
-      NotARun: what is there is not a run alone: there is no config.json, there are other files, or links.
-      OSError: it is no folder, or cannot be read.
+      NotARun: there are files without a config.json, files that are not a run's, or links.
+      OSError: it is not a folder, or cannot be read.
     """
     if path.is_symlink():
         raise NotARun
@@ -78,33 +78,36 @@ def run_alone(path: Path) -> set[str]:
     return names
 
 
-def link_in(path: Path) -> str | None:
-    """The name of a link in `path` that a run would write through; None where there is none."""
+def find_link(path: Path) -> str | None:
+    """The name of a link among the files of a run, which would be written elsewhere; None if there is none."""
     names = [*RUN_FILES, *RUN_FOLDERS, "lock", *(f"tensorboard/{item.name}" for item in path.glob("tensorboard/*"))]
     return next((name for name in names if (path / name).is_symlink()), None)
 
 
 def remove_run(path: Path) -> None:
-    """Removes the run in `path`, if there is one, but for its lock. Raises as `run_alone`."""
-    names = run_alone(path)
+    """Removes the run in `path`, if there is one, except its lock. Raises as `removable_files`."""
+    names = removable_files(path)
     for name in names & {*RUN_FOLDERS}:
         shutil.rmtree(path / name)
-    # The one that says that this is a run goes last: what is half removed can be removed, or gone on with.
+    # config.json last: a run that is only partly removed can still be removed or resumed.
     for name in sorted(names & {*RUN_FILES}, key=lambda name: name == "config.json"):
         (path / name).unlink()
 
 
 class Records:
-    """Writes the tables and events of one run as it goes; a context manager.
+    """Writes the tables and events of one run during training; a context manager.
 
     Args:
-      path: the run's folder, which is this process's own (`files.locked`).
-      resumed_at: where a run is gone on with, the env steps and what `lengths` gave there: what was written later is
-        cut off, for training writes it again. Without it the folder is new: a table that is there is emptied.
+      path: the run's folder, locked by this process (`files.locked`).
+      swept: names of the swept settings.
+      resumed_at: of a resumed run, the env steps of its checkpoint and the `lengths` there. Later rows are cut off,
+        since training writes them again. None: a new run; existing tables are emptied.
+      warn: called with a line of text when something cannot be written.
 
     Raises:
-      Shortened: the tables of a run that is resumed have lost rows.
-      OSError: the folder cannot be made or written.
+      MissingRows: the tables of a resumed run have lost rows.
+      WrongColumns: they have other columns.
+      OSError: the folder cannot be created or written.
     """
 
     def __init__(
@@ -118,25 +121,25 @@ class Records:
     ):
         path.mkdir(parents=True, exist_ok=True)
         env_steps, lengths = resumed_at or (None, {})
-        for table in ("evaluations", "metrics"):  # before one of them is cut
+        for table in ("evaluations", "metrics"):  # before any of them is cut
             file = path / f"{table}.csv"
             if lengths.get(table, 0) > (file.stat().st_size if file.is_file() else 0):
-                raise Shortened(file.name)
+                raise MissingRows(file.name)
         self.path, self.members, self.warn = path, members, warn
         self.swept = [name for name in swept if name != "penalty_coef"]
         columns = [*EVALUATION_COLUMNS, *self.swept]
-        self._evaluations = Table(path / "evaluations.csv", lengths.get("evaluations", 0), columns)
-        # Its columns are known with the first metrics.
-        self._metrics: Table | None = None
+        self._evaluations = CsvTable(path / "evaluations.csv", lengths.get("evaluations", 0), columns)
+        # Created with the first metrics, when its columns are known.
+        self._metrics: CsvTable | None = None
         self._keep_metrics = lengths.get("metrics", 0)
         if not self._keep_metrics:
             (path / "metrics.csv").unlink(missing_ok=True)
-        purge_step = None if env_steps is None else env_steps + 1  # events from there on do not count
+        purge_step = None if env_steps is None else env_steps + 1  # earlier events from there on are ignored
         self._events: list[Events] = []
         if tensorboard:
             labels = [_label(member, self.swept) for member in members]
             self._events = [Events(path / "tensorboard" / label, purge_step) for label in labels]
-        self._room = True
+        self._disk_full = False
 
     def __enter__(self) -> "Records":
         return self
@@ -150,29 +153,29 @@ class Records:
                 events.close()
 
     def lengths(self) -> dict[str, int]:
-        """Bytes of the tables, which are on disk by then.
+        """Bytes of each table, once its rows are on disk.
 
         Raises:
-          OSError: there is no room for them.
+          OSError: the disk has no room for them.
         """
         metrics = self._metrics.length() if self._metrics else self._keep_metrics
         return {"evaluations": self._evaluations.length(), "metrics": metrics}
 
     def report(self, report: Report) -> None:
-        """A row per member in evaluations.csv where there was an evaluation, in metrics.csv where there were steps.
+        """Writes a row per member to evaluations.csv after an evaluation, and to metrics.csv if there were steps.
 
-        A full disk is told to `warn`, once: the rows wait, and TensorBoard's events end.
+        If the disk is full, `warn` is called once; rows wait in memory, and TensorBoard events end.
         """
         if report.metrics and self._metrics is None:
             columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *report.metrics]
             columns += bias.NAMES
-            # SAC's temperature is a metric too, and says the same where it is swept.
+            # SAC's temperature is a metric and may be a swept setting, of the same value.
             columns = [*dict.fromkeys(columns), "wall_seconds"]
-            self._metrics = Table(self.path / "metrics.csv", self._keep_metrics, columns)
-        room = True
+            self._metrics = CsvTable(self.path / "metrics.csv", self._keep_metrics, columns)
+        written = True
         for index, member in enumerate(self.members):
             metrics = {name: float(values[index]) for name, values in report.metrics.items()}
-            judged = {name: float(values[index]) for name, values in report.bias.items()}
+            bias_metrics = {name: float(values[index]) for name, values in report.bias.items()}
             row: dict[str, Any] = {
                 "member": index,
                 "env_steps": report.env_steps,
@@ -189,13 +192,13 @@ class Records:
                     "return_std": float(report.returns[index].std()),
                     "episode_length_mean": float(report.lengths[index].mean()),
                 }
-                # A member that has diverged is frozen: no table may count its critics beside those that learn.
-                counts = not math.isnan(evaluation["return_mean"])
-                measured = {name: metrics.get(name, math.nan) if counts else math.nan for name in ("q_mean", "q_std")}
-                evaluation["value_bias"] = judged.get("value_bias", math.nan)
-                room &= self._evaluations.write(row | evaluation | measured)
+                # A diverged member is frozen: its critics are left out of the table.
+                valid = not math.isnan(evaluation["return_mean"])
+                measured = {name: metrics.get(name, math.nan) if valid else math.nan for name in ("q_mean", "q_std")}
+                evaluation["value_bias"] = bias_metrics.get("value_bias", math.nan)
+                written &= self._evaluations.write(row | evaluation | measured)
             if self._metrics and report.metrics:
-                room &= self._metrics.write(row | metrics | judged)
+                written &= self._metrics.write(row | metrics | bias_metrics)
             if self._events:
                 values = {f"eval/{name}": value for name, value in evaluation.items()}
                 values |= {f"train/{name}": value for name, value in metrics.items()}
@@ -204,12 +207,12 @@ class Records:
                 except OSError as error:
                     self._events = []
                     self.warn(f"no more events for TensorBoard: {error.strerror}")
-        if self._room and not room:
-            self.warn("there is no room for rows of evaluations.csv and metrics.csv: they wait until there is")
-        self._room = room
+        if not written and not self._disk_full:
+            self.warn("the disk has no room for rows of evaluations.csv and metrics.csv: they are kept until it has")
+        self._disk_full = not written
 
     def summary(self, outcome: Outcome) -> dict[str, Any]:
-        """Writes summary.json and gives what is in it."""
+        """Writes summary.json and returns its content."""
         table = read_evaluations(self.path / "evaluations.csv")
         summary = {
             "status": "interrupted" if outcome.interrupted else "diverged" if outcome.diverged else "done",
@@ -220,13 +223,13 @@ class Records:
             "steps_per_second": outcome.steps_per_second,
             "diverged": [{"member": member, "env_steps": steps} for member, steps in outcome.diverged.items()],
         } | summarise(table)
-        with files.whole_file(self.path / "summary.json") as file:
+        with files.atomic_file(self.path / "summary.json") as file:
             file.write((json.dumps(_without_nan(summary), indent=2, allow_nan=False) + "\n").encode())
         return summary
 
 
 def read_evaluations(path: Path) -> dict[str, np.ndarray]:
-    """The columns of an evaluations.csv, NaN where a field is empty."""
+    """The columns of an evaluations.csv; an empty field is NaN."""
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         columns, rows = reader.fieldnames or [], list(reader)
@@ -234,12 +237,12 @@ def read_evaluations(path: Path) -> dict[str, np.ndarray]:
 
 
 def swept_columns(table: Mapping[str, np.ndarray]) -> list[str]:
-    """The columns whose values tell the groups of a run apart."""
+    """The columns of swept settings, by which members are grouped."""
     return ["penalty_coef", *(name for name in table if name not in EVALUATION_COLUMNS)]
 
 
 def groups(table: Mapping[str, np.ndarray]) -> dict[tuple[float, ...], list[int]]:
-    """Values of `swept_columns` -> the members that have them, in the order of the members."""
+    """Values of `swept_columns` -> the members with these values, in their order."""
     found: dict[tuple[float, ...], list[int]] = {}
     names = swept_columns(table)
     for member in sorted({int(value) for value in table["member"]}):
@@ -249,16 +252,16 @@ def groups(table: Mapping[str, np.ndarray]) -> dict[tuple[float, ...], list[int]
 
 
 def of_member(table: Mapping[str, np.ndarray], member: int, column: str) -> np.ndarray:
-    """One member's values of a column, an entry per evaluation."""
+    """One member's values of a column, one per evaluation."""
     return table[column][table["member"] == member]
 
 
 def summarise(table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Groups with their score and final returns, and members with theirs, from the columns of evaluations.csv."""
+    """Scores and final returns of each group and each member, from the columns of evaluations.csv."""
     names = swept_columns(table)
     grouped, members = [], []
     for values, indices in groups(table).items():
-        # A run that dies between two rows leaves one member an evaluation short.
+        # After a crash between two rows, some members lack the last evaluation.
         count = min(len(of_member(table, index, "return_mean")) for index in indices)
         returns = np.stack([of_member(table, index, "return_mean")[:count] for index in indices])
         env_steps = of_member(table, indices[0], "env_steps").astype(int)
@@ -303,7 +306,7 @@ def _label(member: Member, swept: Sequence[str]) -> str:
 
 
 def _without_nan(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null."""
+    """`value` with null for NaN and infinity, which JSON does not have."""
     if isinstance(value, Mapping):
         return {name: _without_nan(item) for name, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Going on with a run: which one is meant, and whether it is the same."""
+"""Resuming a run: which run is meant, and whether its settings are the same."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,47 +7,58 @@ from typing import Any
 
 from experiments.commandline.arguments import UsageError
 from experiments.running import records, run_config, runtime
-from experiments.running.run_config import Described, Member
+from experiments.running.run_config import Member, RunConfig
 from sqt_jax.algorithms import check_physics
-from sqt_jax.config import ConfigError, check_train
+from sqt_jax.config import check_train
+from sqt_jax.settings import ConfigError
 
-# What may differ from one process of a run to the next: more steps, and what does not change what is trained.
+# Settings that may differ when a run is resumed.
 NOT_COMPARED = {"steps"}
+EXPECTS_CHECKPOINTS = "expects a run with checkpoints to resume from"
 
 
-def named(path: Path, wanted: Mapping[str, Any], devices: int | None = None) -> Described:
-    """The run in the folder `path`, with the number of steps that is `wanted`, if any.
-
-    Args:
-      wanted: the settings that were given, by name; those that are swept, and `seeds`, as tuples.
-      devices: how many devices were asked for; None is one for each member.
-
-    Raises:
-      UsageError: there is no run, or it is another one: the message has the settings that differ.
-    """
+def read(path: Path) -> RunConfig:
+    """The run in the folder `path`. Raises `UsageError` if there is none."""
     try:
         run = run_config.read(path)
-        link = records.link_in(path)
-    except run_config.NotDescribed as error:
+        link = records.find_link(path)
+    except run_config.InvalidRunConfig as error:
         raise UsageError(f"--resume={path}: expects the folder of a run; {error}") from None
     except OSError as error:
         raise UsageError(f"--resume={path}: expects a folder that can be read: {error.strerror}") from None
-    refusal = f"expects a folder that holds the run itself; {link} in it is a link" if link else _refusal(run, wanted)
-    if refusal:
-        raise UsageError(f"--resume={path}: {refusal}")
+    if link:
+        raise UsageError(f"--resume={path}: expects a folder that holds the run itself; {link} in it is a link")
+    return run
+
+
+def check(path: Path, run: RunConfig, wanted: Mapping[str, Any], devices: int | None = None) -> RunConfig:
+    """`run`, with the number of steps in `wanted`, if any.
+
+    Args:
+      path: the run's folder.
+      wanted: the settings that were given, by name; swept settings and `seeds` as tuples.
+      devices: the number of devices that was given; None is one per member.
+
+    Raises:
+      UsageError: the run has other settings, which the message lists, or cannot be trained here.
+    """
+    if problem := _problem(run, wanted):
+        raise UsageError(f"--resume={path}: {problem}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
-    members = [_with_train(_evaluated_on(member, run), steps=steps) for member in run.members]
-    runtime.divide_processor(devices or len(members))  # what follows starts JAX
+    members = [_with_train(_with_eval_physics(member, run), steps=steps) for member in run.members]
+    runtime.set_cpu_device_count(devices or len(members))  # before JAX starts
+    config = members[0].config
     try:
-        check_train(members[0].config.train)
-        check_physics(members[0].config)
+        check_train(config.train)
+        if not run.on_own_env:
+            check_physics(config)
     except ConfigError as error:
         raise UsageError(str(error)) from None
     return run._replace(members=members)
 
 
-def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:
-    """The run in one of the folders in `folder` that is as `wanted`, the one that began last.
+def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, RunConfig]:
+    """Of the runs in `folder` that have the settings `wanted`, the one that was started last, and its path.
 
     Raises:
       UsageError: there is none.
@@ -59,7 +70,7 @@ def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:
         raise UsageError(f"--resume: expects a folder that can be read as --out: {error}") from None
     for path in paths:
         try:
-            run = named(path, wanted)
+            run = check(path, read(path), wanted)
         except UsageError:
             continue
         found.append((str(run.content.get("started")), path, run))
@@ -69,36 +80,63 @@ def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, Described]:
     return path, run
 
 
-def with_its_replay(run: Described) -> list[Member]:
-    """The members, with the replay that the run was created with: it does not grow with the number of steps."""
+def check_may_restart(path: Path, checkpoint_every: object) -> None:
+    """Whether a run without any checkpoint may start at step 0 again.
+
+    It may if it died before its first checkpoint. A run that is past its second checkpoint has lost them: its tables
+    are not overwritten.
+
+    Raises:
+      UsageError: it may not.
+    """
+    problem = f"--resume={path}: {EXPECTS_CHECKPOINTS}; it has none"
+    if checkpoint_every == 0 or (path / "summary.json").exists():
+        raise UsageError(problem)
+    # The first checkpoint is certain to be on disk when the second one is due.
+    reached = _last_evaluation(path)
+    if isinstance(checkpoint_every, int) and reached > 2 * checkpoint_every:
+        raise UsageError(f"{problem}, and its evaluations reach step {reached:,}; remove the folder to start again")
+
+
+def with_original_replay(run: RunConfig) -> list[Member]:
+    """The members with the replay capacity that the run was created with: it does not grow with --steps."""
     return [_with_train(member, replay_capacity=run.content["replay_rows"]) for member in run.members]
 
 
-def other_versions(run: Described) -> list[str]:
+def changed_versions(run: RunConfig) -> list[str]:
     """Packages whose version is not the run's, as `jax 0.9.0 -> 0.10.2`."""
-    there, here = run.content["versions"], run_config.versions()
-    return [f"{name} {_text(there.get(name))} -> {here[name]}" for name in here if there.get(name) != here[name]]
+    old, new = run.content["versions"], run_config.versions()
+    return [f"{name} {_text(old.get(name))} -> {new[name]}" for name in new if old.get(name) != new[name]]
 
 
-def _refusal(run: Described, wanted: Mapping[str, Any]) -> str | None:
-    its = run_config.settings_of(run.members, run.swept)
+def _problem(run: RunConfig, wanted: Mapping[str, Any]) -> str | None:
+    """Why the run cannot be resumed with the settings `wanted`."""
+    own = run.content.get("own_env", {}) | run_config.settings_of(run.members, run.swept)
     differing = [
-        f"{name} (its own: {_text(its.get(name))}, now: {_text(value)})"
+        f"{name} (its own: {_text(own.get(name))}, now: {_text(value)})"
         for name, value in wanted.items()
-        if name not in NOT_COMPARED and its.get(name) != value
+        if name not in NOT_COMPARED and own.get(name) != value
     ]
     if differing:
         return f"expects the run's own settings; these differ: {', '.join(differing)}"
-    if wanted.get("steps", its["steps"]) < its["steps"]:
-        return f"expects at least the run's own --steps ({its['steps']:,}), not {wanted['steps']:,}"
-    there, here = str(run.content["versions"].get("sqt_jax")), str(run_config.versions()["sqt_jax"])
-    if there.split(".")[:2] != here.split(".")[:2]:
-        return f"expects a run of sqt_jax {'.'.join(here.split('.')[:2])}, not {there[:20]}"
+    if wanted.get("steps", own["steps"]) < own["steps"]:
+        return f"expects at least the run's own --steps ({own['steps']:,}), not {wanted['steps']:,}"
+    old, new = str(run.content["versions"].get("sqt_jax")), str(run_config.versions()["sqt_jax"])
+    if old.split(".")[:2] != new.split(".")[:2]:
+        return f"expects a run of sqt_jax {'.'.join(new.split('.')[:2])}, not {old[:20]}"
     return None
 
 
-def _evaluated_on(member: Member, run: Described) -> Member:
-    """The member, evaluated on what its run began with: what `auto` chose may be another physics on this machine."""
+def _last_evaluation(path: Path) -> int:
+    """The env steps of the last row of evaluations.csv; 0 if there is none."""
+    try:
+        return int(max(records.read_evaluations(path / "evaluations.csv")["env_steps"], default=0))
+    except (OSError, ValueError, KeyError):
+        return 0
+
+
+def _with_eval_physics(member: Member, run: RunConfig) -> Member:
+    """The member, evaluated on the physics that its run started with: `auto` may choose another one on this machine."""
     physics = run.content.get("evaluated_on") or member.config.eval_physics
     return member._replace(config=dataclasses.replace(member.config, eval_physics=physics))
 

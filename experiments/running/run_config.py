@@ -1,4 +1,10 @@
-"""config.json of a run: what it was started with, and reading that back to go on with it."""
+"""Writes and reads a run's config.json: its settings, members, versions and commands.
+
+Keys: `settings` (of the first member), `preset`, `replay_rows` (the replay's capacity per member, fixed when the run is
+created), `evaluated_on` (the physics that `eval_physics` chose), `swept` (names), `members` (seed and swept values),
+`output` (`flag_table.OutputConfig`), `command`, `started`, `device`, `commit`, `versions`, `resumed` (an entry for each
+time), and `own_env` (sizes), only of a run whose environment was handed in.
+"""
 
 import json
 import os
@@ -15,9 +21,10 @@ import jax
 from experiments.commandline.flags import MAX_MEMBERS
 from experiments.running import files
 from sqt_jax import envs
-from sqt_jax.algorithms import eval_physics_of, make_config
-from sqt_jax.config import Config, ConfigError
-from sqt_jax.types import Scalars
+from sqt_jax.algorithms import OWN_PHYSICS, eval_physics_of, make_config
+from sqt_jax.config import Config
+from sqt_jax.settings import ConfigError
+from sqt_jax.types import Environment, Scalars
 
 NAME = "config.json"
 MAX_BYTES = 10_000_000
@@ -25,22 +32,27 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "brax", "g
 
 
 class Member(NamedTuple):
-    """One member of a run: a seed with one setting of the swept scalars."""
+    """One member of a run: a seed with one value of each swept setting."""
 
     seed: int
     config: Config
 
 
-class Described(NamedTuple):
-    """A run as its config.json tells of it."""
+class RunConfig(NamedTuple):
+    """A run as recorded in its config.json."""
 
     members: list[Member]
     swept: list[str]
-    content: dict[str, Any]
+    content: dict[str, Any]  # of the file
+
+    @property
+    def on_own_env(self) -> bool:
+        """Whether its environment was handed in."""
+        return self.members[0].config.physics == OWN_PHYSICS
 
 
-class NotDescribed(ValueError):
-    """There is no config.json of a run, and why."""
+class InvalidRunConfig(ValueError):
+    """config.json is missing or is not a run's; the text says why."""
 
 
 def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member]:
@@ -49,17 +61,27 @@ def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member
 
 
 def settings_of(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
-    """All settings of a run by name; those that are swept, and `seeds`, as tuples of their values."""
+    """All settings of a run by name; swept settings and `seeds` as tuples of their values."""
     settings = members[0].config.flat() | {"seeds": _values(member.seed for member in members)}
     return settings | {name: _values(getattr(m.config.agent, name) for m in members) for name in swept}
 
 
-def describe(
-    members: Sequence[Member], swept: Sequence[str], command: Sequence[str], preset: str, output: Mapping[str, Any]
+def sizes_of(env: Environment | None) -> dict[str, int]:
+    """The sizes that config.json records of an environment handed in; none without one."""
+    return {"observation_size": env.observation_size, "action_size": env.action_size} if env else {}
+
+
+def new_content(
+    members: Sequence[Member],
+    swept: Sequence[str],
+    command: Sequence[str],
+    preset: str,
+    output: Mapping[str, Any],
+    own_env: Environment | None = None,
 ) -> dict[str, Any]:
-    """What config.json holds: the settings (of the first member), the members, and what they ran on."""
+    """The content of config.json for a run that starts now."""
     device = jax.local_devices()[0]
-    return {
+    content = {
         "settings": members[0].config.flat(),
         "preset": preset,
         "replay_rows": members[0].config.train.capacity,
@@ -78,20 +100,21 @@ def describe(
         "versions": versions(),
         "resumed": [],
     }
+    return content if own_env is None else content | {"own_env": sizes_of(own_env)}
 
 
-def read(path: Path) -> Described:
-    """The run in the folder `path`, by its config.json.
+def read(path: Path) -> RunConfig:
+    """The run in the folder `path`, from its config.json.
 
     Raises:
-      NotDescribed: there is no such file, or it does not describe a run.
+      InvalidRunConfig: there is no such file, or it does not describe a run.
     """
     try:
         content = files.read_json(path / NAME, MAX_BYTES)
         settings, swept, entries = dict(content["settings"]), list(content["swept"]), list(content["members"])
         known = set(swept) <= {*Scalars._fields} and len(set(swept)) == len(swept)
         if not known or not 0 < len(entries) <= MAX_MEMBERS:
-            raise NotDescribed(f"its {NAME} does not describe a run")
+            raise InvalidRunConfig(f"its {NAME} does not describe a run")
         configs = {
             values: make_config(**settings | dict(zip(swept, values, strict=True)))
             for values in _values(tuple(entry[name] for name in swept) for entry in entries)
@@ -100,32 +123,36 @@ def read(path: Path) -> Described:
         kinds = {"output": dict, "versions": dict, "resumed": list, "preset": str, "replay_rows": int}
         for key, kind in kinds.items():
             if not isinstance(content[key], kind):
-                raise NotDescribed(f"its {NAME} does not describe a run")
-        train, rows = members[0].config.train, content["replay_rows"]
+                raise InvalidRunConfig(f"its {NAME} does not describe a run")
+        if not isinstance(content.get("own_env", {}), dict):
+            raise InvalidRunConfig(f"its {NAME} does not describe a run")
+        config, rows = members[0].config, content["replay_rows"]
+        train = config.train
         if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
-            raise NotDescribed(f"its {NAME} names a replay that cannot be (replay_rows)")
-        if content.get("evaluated_on") not in (None, *envs.physics_of(members[0].config.env)):
-            raise NotDescribed(f"its {NAME} names a physics that cannot be (evaluated_on)")
+            raise InvalidRunConfig(f"its {NAME} has an invalid replay capacity (replay_rows)")
+        physics = (OWN_PHYSICS,) if config.physics == OWN_PHYSICS else envs.physics_of(config.env)
+        if content.get("evaluated_on") not in (None, *physics):
+            raise InvalidRunConfig(f"its {NAME} has an invalid physics (evaluated_on)")
     except OSError as error:
-        raise NotDescribed(f"it has no {NAME} that can be read ({error.strerror})") from None
+        raise InvalidRunConfig(f"it has no {NAME} that can be read ({error.strerror})") from None
     except ConfigError as error:
-        raise NotDescribed(f"its {NAME} names a setting that cannot be: {str(error)[:300]}") from None
-    except NotDescribed:
+        raise InvalidRunConfig(f"its {NAME} has an invalid setting: {str(error)[:300]}") from None
+    except InvalidRunConfig:
         raise
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise NotDescribed(f"its {NAME} does not describe a run ({type(error).__name__})") from None
-    return Described(members, swept, content)
+        raise InvalidRunConfig(f"its {NAME} does not describe a run ({type(error).__name__})") from None
+    return RunConfig(members, swept, content)
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
-    with files.whole_file(path / NAME) as file:
+    with files.atomic_file(path / NAME) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
-def resumed(
+def resumed_content(
     content: dict[str, Any], steps: int, output: Mapping[str, Any], env_steps: int, command: Sequence[str]
 ) -> dict[str, Any]:
-    """config.json of a run that is gone on with at `env_steps`, to `steps`."""
+    """The content of config.json for a run that is resumed at `env_steps` and trained to `steps`."""
     entry = {"env_steps": env_steps, "at": _now(), "command": list(command)}
     entry |= {"commit": _commit(), "versions": versions()}
     settings = content["settings"] | {"steps": steps}
@@ -143,7 +170,7 @@ def default_name(changed: Mapping[str, Any], now: datetime) -> str:
         return "+".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
     words = [f"{name}={text(value)}" for name, value in changed.items()]
-    # File names end at 255 bytes; which settings they were is in config.json.
+    # File names have at most 255 bytes; config.json has all settings.
     label = "_".join(words)[:180].replace("/", "-")
     return "_".join(filter(None, [label, now.strftime("%Y%m%dT%H%M%SZ")]))
 
@@ -170,7 +197,7 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout this file belongs to, with `+changes` where files differ; None without one."""
+    """The commit of the git checkout that this file is in, with `+changes` if files differ; None outside of one."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(Path(__file__).parent), *arguments]

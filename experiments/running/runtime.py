@@ -1,13 +1,15 @@
-"""What a process sets before JAX starts: the cache of compiled programs, one XLA option, the processor's devices."""
+"""Settings that a process makes before JAX starts: the compilation cache, one XLA option, the number of CPU devices."""
 
 import os
 from contextlib import suppress
 from pathlib import Path
 
+import jax
+
 from sqt_jax.envs.physics.threads import usable_cores
 
-# XLA's CPU backend compiles loops over little data into one function each. Its own limit leaves MJX's solver loops out,
-# whose many small kernels are then dispatched one by one.
+# XLA's CPU backend compiles a loop over little data into a single function. Its default limit excludes MJX's solver
+# loops, so that their many small kernels are dispatched one at a time.
 SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 SMALL_LOOP_BYTES = 1_000_000
 
@@ -21,28 +23,24 @@ def cache_directory() -> Path:
 
 
 def prepare() -> None:
-    """Call before the first computation. What the user has set in the environment stays."""
+    """Makes these settings; call before the first computation. Variables that the user has set take precedence."""
     xla_flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in xla_flags:
         option = f"--xla_backend_extra_options={SMALL_LOOPS}={SMALL_LOOP_BYTES}"
         os.environ["XLA_FLAGS"] = f"{xla_flags} {option}".strip()
 
-    import jax
-
-    divide_processor(usable_cores())
+    set_cpu_device_count(usable_cores())
     jax.config.update("jax_compilation_cache_dir", str(cache_directory()))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def divide_processor(devices: int) -> None:
-    """Makes the processor at least so many XLA devices, up to 16 for each core; without effect once JAX has started.
+def set_cpu_device_count(devices: int) -> None:
+    """Makes the CPU at least `devices` XLA devices, at most 16 per core. No effect once JAX has started.
 
-    Devices are threads that need not wait for one another. One for each member shares a sweep evenly, whatever its
-    size. What that gains is in BUILD_NOTES.md, "Throughput": some of the update, next to nothing of a whole loop.
+    Each device is a thread. With one device per member, members do not wait for each other, and any number of members
+    is spread evenly. The gain is small; BUILD_NOTES.md, "Throughput", has the measurements.
     """
-    import jax
-
     count = min(max(devices, usable_cores()), DEVICES_PER_CORE * usable_cores())
-    with suppress(RuntimeError):  # it has started, with the devices that it has
+    with suppress(RuntimeError):  # JAX has started, and keeps its devices
         jax.config.update("jax_num_cpu_devices", count)

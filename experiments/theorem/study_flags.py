@@ -121,10 +121,10 @@ def _check_out(name: str, overwrite: bool) -> None:
     path = Path(name)
     if not name or "\0" in name:
         raise UsageError("--out: expects a folder")
-    arguments.refuse_folder("--out", path)
+    arguments.reject_folder("--out", path)
     try:
         if not overwrite and path.exists() and any(path.iterdir()):
             raise UsageError(f"--out={name}: exists; expects another folder, or also --overwrite")
     except OSError as error:
         raise UsageError(f"--out={name}: expects a folder that can be read: {error.strerror}") from None
-    arguments.refuse_existing(path, (study.TABLE, study.FIGURE), overwrite)
+    arguments.reject_existing(path, (study.TABLE, study.FIGURE), overwrite)

@@ -1,0 +1,241 @@
+"""One process's part of a run: from the command line's options to the exit code."""
+
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+from experiments.commandline.arguments import (
+    DIVERGED,
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    UsageError,
+    printable,
+)
+from experiments.commandline.flags import Options
+from experiments.evidence import figures
+from experiments.running import files, manifests, records, resume, run_config
+from experiments.running.announce import Announcer
+from experiments.running.checkpoints import CheckpointStore, Restored
+from experiments.running.csv_rows import MissingRows, WrongColumns
+from experiments.running.loop import START, Outcome, Position, train_loop
+from experiments.running.plan import Plan, make_plan, name_taken, not_only_a_run
+from experiments.running.progress import Display
+from experiments.running.run_config import Member
+from experiments.running.signals import stop_on_signal
+from sqt_jax.algorithms import make_trainer, replay_of
+from sqt_jax.policy import save_policy
+from sqt_jax.train import TrainState, make_sweep
+from sqt_jax.types import Array, Environment, Scalars
+
+
+def start_session(options: Options, env: Environment | None, command: Sequence[str]) -> "Session":
+    """The session of a parsed command line. Raises `UsageError` as `make_plan`."""
+    return Session(make_plan(options, env), command)
+
+
+class Session:
+    """Holds the parts of a run (sweep, checkpoints, tables, display) and trains it to its end or to a signal.
+
+    Args:
+      plan: what to train and where.
+      command: the command line, for config.json.
+    """
+
+    def __init__(self, plan: Plan, command: Sequence[str]):
+        self.plan, self.command = plan, command
+        self.console = Console()
+        self.display = Display(self.console, plan.train.steps, quiet=plan.options.quiet)
+        self.announcer = Announcer(self.console, plan)
+        trainer = make_trainer(plan.config, plan.own_env)
+        self.sweep = make_sweep(trainer, plan.layout)
+        self.init_arguments = _init_arguments(plan.members)
+        # Shapes of the members only: with a layout, a state has padding too.
+        self.template = jax.eval_shape(make_sweep(trainer).init, *self.init_arguments)
+        self.store = CheckpointStore(
+            plan.path / "checkpoint",
+            replay_of(plan.config, plan.env),
+            plan.layout,
+            plan.output["keep_checkpoints"],
+            self.display.message,
+        )
+        self.restored: Restored | None = None  # the checkpoint that training resumes from
+
+    def run(self) -> int:
+        """Restores, trains and writes the results; returns the exit code.
+
+        Raises:
+          UsageError: the run cannot be started or resumed. Nothing in an existing folder has changed then.
+        """
+        with ExitStack() as stack:
+            stack.enter_context(self._locked())
+            stack.enter_context(self.display)
+            received = stack.enter_context(stop_on_signal())
+            stack.callback(self.store.wait)
+            # A new run writes its config.json first, so that it can be resumed from then on. An existing run is not
+            # changed before it is certain that it can be resumed.
+            if self.plan.resumed:
+                self.restored = self._restore()
+                if self.restored and self._is_finished(self.restored.position):
+                    self.announcer.already_finished()
+                    return DIVERGED if self.restored.position.diverged else DONE
+            else:
+                self._claim()
+            tables = stack.enter_context(self._open_tables())
+            if self.plan.resumed:
+                self._record_resumption(self.plan.resumed)
+                self.store.remove_others()
+            resumed_at = self.restored.position.env_steps if self.restored else None
+            self.announcer.start(resumed_at, self.store.sizes(self.template))
+            outcome = self._train(tables, lambda: bool(received))
+            try:
+                curves = self._write_results(outcome)
+                summary = tables.summary(outcome)  # last: its existence says that the run has ended
+            except OSError as error:
+                print(printable(f"the results cannot be written: {error}"), file=sys.stderr)
+                return FAILED
+
+        self.announcer.end(outcome, summary, tables.swept, curves)
+        return INTERRUPTED if outcome.interrupted else DIVERGED if outcome.diverged else DONE
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keeps other processes out of the run's folder."""
+        path, resumed = self.plan.path, self.plan.resumed
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(files.locked(path))
+            except files.Busy as busy:
+                flag = f"--resume={path}" if resumed else f"--name={path.name}"
+                raise UsageError(f"{flag}: process {busy.process} is training {path}; expects another run") from None
+            except OSError as error:
+                raise self._cannot_write(error) from None
+            yield
+
+    def _cannot_write(self, error: OSError) -> UsageError:
+        flag = f"--resume={self.plan.path}" if self.plan.resumed else f"--out={self.plan.options.out}"
+        return UsageError(f"{flag}: expects a folder that can be written: {error}")
+
+    def _restore(self) -> Restored | None:
+        """The latest valid checkpoint; None: the run has none yet and starts at step 0."""
+        assert self.plan.resumed
+        try:
+            restored = self.store.restore(self.template)
+        except manifests.CannotResume as error:
+            raise UsageError(f"--resume={self.plan.path}: {resume.EXPECTS_CHECKPOINTS}; {error}") from None
+        if restored is None:
+            resume.check_may_restart(self.plan.path, self.plan.resumed.content["output"].get("checkpoint_every"))
+        return restored
+
+    def _is_finished(self, at: Position) -> bool:
+        """Whether all steps, evaluations and results exist: then summary.json is not written again."""
+        results = self._summary.exists() and (self.plan.path / "policy").is_dir()
+        return at.env_steps == at.evaluated == self.plan.train.steps and results
+
+    @property
+    def _summary(self) -> Path:
+        return self.plan.path / "summary.json"
+
+    def _claim(self) -> None:
+        """Makes the folder a run by writing config.json, after removing an existing run if --overwrite allows it."""
+        plan = self.plan
+        try:
+            if plan.options.overwrite:
+                records.remove_run(plan.path)
+            if records.is_taken(plan.path):
+                raise name_taken(plan.path)
+            content = run_config.new_content(
+                plan.members, plan.swept, self.command, plan.options.preset, plan.output, plan.own_env
+            )
+            run_config.write(plan.path, content)
+        except records.NotARun:
+            raise not_only_a_run(plan.path) from None
+        except OSError as error:
+            raise self._cannot_write(error) from None
+
+    def _record_resumption(self, run: run_config.RunConfig) -> None:
+        """Adds this process to config.json, and removes summary.json, which says that the run has ended."""
+        plan = self.plan
+        at = self.restored.position.env_steps if self.restored else 0
+        try:
+            content = run_config.resumed_content(run.content, plan.train.steps, plan.output, at, self.command)
+            run_config.write(plan.path, content)
+            self._summary.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._cannot_write(error) from None
+
+    def _open_tables(self) -> records.Records:
+        """The run's tables: empty ones, or those of a resumed run, cut to their length at its checkpoint."""
+        plan = self.plan
+        resumed_at = None
+        if plan.resumed:
+            restored = self.restored
+            resumed_at = (restored.position.env_steps, restored.lengths) if restored else (-1, {})
+        try:
+            return records.Records(
+                plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, self.display.message
+            )
+        except MissingRows as error:
+            raise UsageError(
+                f"--resume={plan.path}: {error} has lost rows since the checkpoint; expects a run with complete tables"
+            ) from None
+        except WrongColumns as error:
+            raise UsageError(
+                f"--resume={plan.path}: expects a run of this version; {error} has other columns"
+            ) from None
+        except OSError as error:
+            raise self._cannot_write(error) from None
+
+    def _train(self, tables: records.Records, stop: Callable[[], bool]) -> Outcome:
+        def save(state: TrainState, position: Position) -> None:
+            try:
+                lengths = tables.lengths()
+            except OSError as error:
+                self.display.message(
+                    f"no checkpoint at step {position.env_steps:,} ({error.strerror}); training continues"
+                )
+                return
+            self.store.save(state, position, lengths)
+
+        outcome = train_loop(
+            self.sweep,
+            self.restored.state if self.restored else self.sweep.init(*self.init_arguments),
+            self.plan.train,
+            len(self.plan.members),
+            report=tables.report,
+            display=self.display,
+            stop=stop,
+            start=self.restored.position if self.restored else START,
+            checkpoint_every=self.plan.output["checkpoint_every"],
+            save=save,
+        )
+        self.store.wait()
+        return outcome
+
+    def _write_results(self, outcome: Outcome) -> bool:
+        """Writes the policies and, if there are evaluations, curves.png; returns whether there are."""
+        plan = self.plan
+        policy, part = plan.path / "policy", plan.path / "policy.part"
+        shutil.rmtree(part, ignore_errors=True)
+        save_policy(part, plan.config, plan.env, outcome.state.agent, len(plan.members))
+        shutil.rmtree(policy, ignore_errors=True)  # of an earlier process
+        part.rename(policy)
+        table = records.read_evaluations(plan.path / "evaluations.csv")
+        if not len(table["member"]):
+            return False
+        figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+        return True
+
+
+def _init_arguments(members: Sequence[Member]) -> tuple[Array, Scalars]:
+    """The members' keys [S] and scalars [S], for `Sweep.init`."""
+    seeds = jnp.array([member.seed for member in members], jnp.uint32)
+    agents = [member.config.agent for member in members]
+    scalars = (jnp.array([getattr(agent, name) for agent in agents], jnp.float32) for name in Scalars._fields)
+    return jax.vmap(jax.random.key)(seeds), Scalars(*scalars)

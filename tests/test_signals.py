@@ -1,0 +1,34 @@
+"""The first SIGINT or SIGTERM stops a run, the second one ends the process."""
+
+import signal
+
+from experiments.running import signals
+
+
+def test_a_second_signal_ends_the_process_at_once(monkeypatch):
+    codes = []
+    monkeypatch.setattr(signals.os, "_exit", codes.append)
+    with signals.stop_on_signal() as received:
+        signal.raise_signal(signal.SIGTERM)
+        assert received == [signal.SIGTERM] and codes == []
+        signal.raise_signal(signal.SIGINT)
+        assert codes == [130]
+
+
+def test_a_sigterm_that_comes_twice_at_once_is_one(monkeypatch):
+    """By a batch system and by `experiments.sweep`, which passes its own on."""
+    codes, now = [], []
+    monkeypatch.setattr(signals.os, "_exit", codes.append)
+    monkeypatch.setattr(signals.time, "monotonic", lambda: now[-1])
+    with signals.stop_on_signal() as received:
+        for at, left in [(100.0, []), (100.9, []), (102.0, [130])]:
+            now.append(at)
+            signal.raise_signal(signal.SIGTERM)
+            assert received[0] == signal.SIGTERM and codes == left
+
+
+def test_the_handlers_are_the_old_ones_afterwards():
+    before = [signal.getsignal(number) for number in signals.SIGNALS]
+    with signals.stop_on_signal():
+        assert [signal.getsignal(number) for number in signals.SIGNALS] != before
+    assert [signal.getsignal(number) for number in signals.SIGNALS] == before
