@@ -89,7 +89,11 @@ def transition_std(next_q: Array, *, coef: Array | float, ddof: int = 1) -> Arra
 
 
 # The setting `penalty`: called with next_q [N, B] and the settings `penalty_coef` (as coef) and `ddof`.
-PENALTIES: dict[str, Formula] = {"none": no_penalty, "batch_std": batch_std, "transition_std": transition_std}
+PENALTIES: dict[str, Formula] = {
+    "none": no_penalty,
+    "batch_std": batch_std,
+    "transition_std": transition_std,
+}
 # The setting `reduce`: called with next_q [N, B] and the update's random subset [M] of critics.
 REDUCTIONS: dict[str, Formula] = {
     "min": lambda q, subset: min_over_critics(q),

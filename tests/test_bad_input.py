@@ -136,7 +136,7 @@ def test_a_bad_flag_is_rejected(folder, capsys, argument, begins, expects):
 # Flags that do not go together
 
 TOGETHER = [
-    ("--algo=sac --penalty_coef=0.5", "--penalty_coef:", "expects 0 for sac"),
+    ("--algo=sac --penalty_coef=0.5", "--penalty_coef:", "has no effect with sac"),
     ("--algo=td3_sqt --temperature=0.1,0.2", "--temperature:", "has no effect with td3_sqt"),
     ("--algo=td7 --num_envs=2", "--num_envs:", "expects 1 for td7"),
     ("--num_envs=7", "--steps:", "expects a multiple of num_envs"),

@@ -114,7 +114,7 @@ def test_the_swimmers_only_physics_is_its_default():
     [
         ("brax:ant", "mujoco", "physics: expects one of mjx, generalized, spring, positional, not 'mujoco'"),
         ("ant", "spring", "physics: expects one of mjx, mujoco, warp, not 'spring'"),
-        ("brax:antt", "mjx", "got 'brax:antt'; did you mean brax:ant?"),
+        ("brax:antt", "mjx", "not 'brax:antt'; did you mean brax:ant?"),
     ],
 )
 def test_unknown_names_and_physics_are_rejected(name, physics, message):

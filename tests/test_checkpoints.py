@@ -276,7 +276,7 @@ def test_another_format_is_rejected_and_kept(case, tmp_path, monkeypatch):
     case.saved(store, 50, 60)
     before = listing(store)
     monkeypatch.setattr(manifests, "FORMAT", 99)
-    with pytest.raises(CannotResume, match="are of format '3', not 99"):
+    with pytest.raises(CannotResume, match="are of format '4', not 99"):
         case.store(tmp_path).restore(case.template)
     assert listing(store) == before
 

@@ -257,7 +257,7 @@ BAD = [
     ("--steps=two\nlines", "--steps=two\\nlines: expects a whole number"),
     ("--algo=sac_sqtt", "--algo: expects one of td3, td3_sqt, td3_sqt_tuple, sac, sac_sqt, sac_sqt_tuple, "),
     ("--env=antt", "--env: expects one of cheetah, walker, ant, humanoid"),
-    ("--algo=sac --penalty_coef=0.5", "--penalty_coef: expects 0 for sac"),
+    ("--algo=sac --penalty_coef=0.5", "--penalty_coef: has no effect with sac"),
     ("--algo=td3_sqt --temperature=0.1,0.2", "--temperature: has no effect with td3_sqt"),
     (
         "--algo=td3 --preset=released --networks=mlp",

@@ -257,9 +257,15 @@ assert median.update(median.init(jax.random.key(1)), batch, keys[4], 0)[1].shape
 
 
 def test_a_setting_is_added_as_shown(extended):
+    """In --help, the validation, the command line and config.json."""
     code = """
 import sqt_jax
-from experiments.commandline import flag_table
+from experiments.commandline import flag_table, flags
+from experiments.running import run_config
+options = flags.parse(["run", "--algo=td3_range", "--env=ant", "--my_threshold=0.25"])
+config = sqt_jax.make_config(options.algo, options.env, **options.settings)
+content = run_config.new_content(run_config.make_members([0], [config]), [], [], "paper", {})
+assert content["settings"]["my_threshold"] == 0.25 and content["settings"]["penalty"] == "range"
 assert "--my_threshold" in flag_table.help_text() and "what it does" in flag_table.help_text()
 assert sqt_jax.make_config("td3_sqt", "ant", my_threshold=0.25).flat()["my_threshold"] == 0.25
 for algo, value, words in [("td3_sqt", 2.0, "expect"), ("td3", 0.25, "has no effect")]:

@@ -60,5 +60,5 @@ def test_damaged_settings_of_an_unknown_algorithm_are_rejected(tmp_path, damage)
 
 
 def test_a_known_algorithm_with_a_wrong_setting_is_rejected(tmp_path):
-    with pytest.raises(UsageError, match="names a setting that cannot be"):
+    with pytest.raises(UsageError, match="has an invalid setting"):
         read(rename(write_run(tmp_path), "td3", steps=-1))

@@ -13,15 +13,16 @@ from experiments.evidence.paper_tables import table_4
 from experiments.evidence.pooling import arrange, collect, pool
 from experiments.evidence.variants import baseline_of, penalty_of, variant_with, variants_of
 from sqt_jax.algorithms import ALGORITHMS
-from sqt_jax.config import CHOICES
+from sqt_jax.settings import Setting
 
 
 @pytest.fixture
 def td3_range(monkeypatch):
     """A row as a user adds it: TD3 with a new penalty, under a name that says nothing about it."""
     row = ALGORITHMS["td3_sqt"]
-    monkeypatch.setitem(CHOICES, "penalty", (*CHOICES["penalty"], "range"))
-    monkeypatch.setitem(ALGORITHMS, "careful", row._replace(settings=row.settings | {"penalty": "range"}))
+    check = Setting.check
+    monkeypatch.setattr(Setting, "check", lambda self, value: value == "range" or check(self, value))
+    monkeypatch.setitem(ALGORITHMS, "careful", row._replace(settings={**row.settings, "penalty": "range"}))
     return "careful"
 
 
