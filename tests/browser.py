@@ -1,4 +1,4 @@
-"""A headless Chromium, driven through its debugging pipe (the DevTools protocol): nothing beside it is needed."""
+"""A headless Chromium, driven through its debugging pipe (the DevTools protocol): it needs nothing else."""
 
 import base64
 import json

@@ -154,7 +154,7 @@ TOGETHER = [
     ("--preset=released --networks=mlp", "--", "by --preset=released"),
     ("--env=brax:ant --physics=mujoco", "--physics:", "expects one of"),
     ("--steps=2e9 --replay_capacity=2e9", "--replay_capacity=", "expects a smaller number"),
-    ("--resume --overwrite", "--overwrite:", "no --resume beside it"),
+    ("--resume --overwrite", "--overwrite:", "expects no --resume"),
 ]
 
 
@@ -358,7 +358,7 @@ RESUMED = [
     ("--resume=RUN --lr=0.5 --seeds=3 --algo=td3", "--resume=RUN:", ITS_OWN + "lr .*, algo .*, seeds "),
     ("--resume=RUN --env=antt", "--env:", "expects one of"),
     ("--resume=RUN --penalty_coef=0.1,0.2", "--resume=RUN:", ITS_OWN + "penalty_coef"),
-    ("--resume=RUN --overwrite", "--overwrite:", "no --resume beside it"),
+    ("--resume=RUN --overwrite", "--overwrite:", "expects no --resume"),
     ("--resume=RUN --name=run", "--name:", "has no effect with --resume=RUN"),
     ("--resume=RUN --out=runs", "--out:", "has no effect with --resume=RUN"),
     ("--resume=RUN --keep_checkpoints=0", "--keep_checkpoints:", "at least 1"),

@@ -58,7 +58,7 @@ class Case:
 
 
 def same(one, other):
-    """Bit for bit, but for final observations that no transition needs any more: a checkpoint does not hold those."""
+    """Bit for bit, except final observations that no transition needs any more: a checkpoint does not hold those."""
 
     def held(state):
         replay = state.replay

@@ -23,7 +23,7 @@ CAPACITY, BATCH = 1000, 16  # 1000 rows: 7 full blocks and one of 104 rows
 
 
 def transitions(ids) -> Transition:
-    """Transitions whose reward is the id (from 1), and so told from an empty row, which is all zeros."""
+    """Transitions whose reward is the id (from 1), which distinguishes it from an empty row, which is all zeros."""
     ids = np.asarray(ids, np.float32)
     obs, action = np.repeat(ids[..., None], O, -1), np.repeat(-ids[..., None], A, -1)
     return Transition(obs, action, ids, obs + 1, np.ones_like(ids))
@@ -389,7 +389,7 @@ def test_the_loop_over_members_writes_priorities_and_storage_in_place(loops):
 
 
 def test_only_the_rare_refresh_reads_all_priorities(loops):
-    """What sums or compares over a whole level lies in a branch, or in a kernel that branches alone call."""
+    """Sums and comparisons over a complete level are in a branch, or in a kernel that only branches call."""
     for state, executable in loops.values():
         text = executable.as_text()
         lines = instructions(text)
@@ -412,7 +412,7 @@ def test_only_the_rare_refresh_reads_all_priorities(loops):
 
 
 def test_nothing_else_grows_with_the_capacity(loops):
-    """The two programs are the same but for the shapes of what the state holds."""
+    """The two programs differ in the shapes of the state only."""
     programs = {}
     for capacity, (state, executable) in loops.items():
         held = held_shapes(state)

@@ -140,9 +140,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
         if not own[required] and resume in (None, LATEST):
             raise UsageError(f"--{required}: is required, as in {EXAMPLE}")
     if resume is not None and overwrite:
-        raise UsageError(
-            "--overwrite: expects no --resume beside it: the one replaces a run, the other goes on with it"
-        )
+        raise UsageError("--overwrite: expects no --resume: one replaces a run, the other continues it")
     for name in ("out", "name", "preset"):
         if folder_given and own[name] is not None:
             raise UsageError(f"--{name}: has no effect with --resume={resume}")
