@@ -15,7 +15,7 @@ from sqt_jax import envs, lap, replay, train
 from sqt_jax.agents import released, sac, td3, td7
 from sqt_jax.config import SETTINGS, AgentConfig, Config, TrainConfig, check_agent, check_train
 from sqt_jax.ring import Ring
-from sqt_jax.settings import ConfigError, settings_of
+from sqt_jax.settings import ConfigError, current_names, settings_of
 from sqt_jax.suggestions import did_you_mean, expects_one_of
 from sqt_jax.types import Agent, Environment, Parts, Replay
 
@@ -160,6 +160,7 @@ def make_config(algo: str, env: str | Environment, **settings: Any) -> Config:
     Raises:
       ConfigError: an unknown name or an invalid value; the message names the setting and what it expects.
     """
+    settings = current_names(settings, SETTINGS)
     physics, eval_physics = settings.pop("physics", None), settings.pop("eval_physics", "auto")
     training = {name: settings.pop(name) for name in settings_of(TrainConfig).keys() & settings.keys()}
     if algo in ALGORITHMS:

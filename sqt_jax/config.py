@@ -70,17 +70,17 @@ class AgentConfig:
     )
     # TD7's replay and policy checkpoints (its authors' names in brackets).
     priority_exponent: float = setting(0.4, "LAP's exponent (alpha)", low=0, high=1, features=("checkpoints",))
-    checkpoint_switch: int = setting(
-        750_000,
-        "updates after which a policy is assessed on --assessment_episodes, not one (steps_before_checkpointing)",
-        low=0, features=("checkpoints",),
+    policy_checkpoint_switch: int = setting(
+        750_000, "updates until a policy is assessed on --assessment_episodes, not one (steps_before_checkpointing)",
+        low=0, features=("checkpoints",), formerly="checkpoint_switch",
     )  # fmt: skip
     assessment_episodes: int = setting(
         20, "episodes per assessment after the switch (max_eps_when_checkpointing)", low=1, features=("checkpoints",)
     )
-    checkpoint_reset_weight: float = setting(
-        0.9, "factor on the best minimum return at the switch (reset_weight)", low=0, high=1, features=("checkpoints",)
-    )
+    policy_checkpoint_reset_weight: float = setting(
+        0.9, "factor on the best minimum return at the switch (reset_weight)",
+        low=0, high=1, features=("checkpoints",), formerly="checkpoint_reset_weight",
+    )  # fmt: skip
     # What the authors of SQT released under the names of TD3, SAC and TD7 (`agents.released`).
     networks: str = setting("mlp", "mlp, or TD7's networks and update without its checkpoints", choices=("mlp", "sale"))
     sampled_actor: bool = setting(

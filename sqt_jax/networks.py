@@ -19,9 +19,9 @@ class Network(NamedTuple):
 
 
 class Dense(nn.Module):
-    """A linear layer of several inputs side by side, initialised as torch does, U(±1/sqrt(fan_in)).
+    """A linear layer of several inputs, initialised as torch does, U(±1/sqrt(fan_in)).
 
-    Each input has a matrix product of its own, so an input without a gradient costs none in the backward pass.
+    Each input has a matrix product of its own: one without a gradient costs none in the backward pass.
     """
 
     features: int
@@ -71,7 +71,6 @@ class Critic(nn.Module):
 
 
 def network(module: nn.Module) -> Network:
-    """A module's pure functions."""
     return Network(module.init, module.apply)
 
 

@@ -41,23 +41,17 @@ def min_over_subset(next_q: Array, subset: Array) -> Array:
 
 
 def random_subset(key: Array, ensemble_size: int, subset_size: int) -> Array:
-    """Indices [M] of `subset_size` different critics out of `ensemble_size`; all subsets are equally likely.
-
-    Raises:
-      ValueError: there are fewer critics.
-    """
+    """Indices [M] of a random subset of the critics. Raises ValueError if there are fewer than `subset_size`."""
     if not 1 <= subset_size <= ensemble_size:
         raise ValueError(f"expected a subset of 1 to {ensemble_size} critics, not {subset_size}")
     return jax.random.permutation(key, ensemble_size)[:subset_size]
 
 
 def std_over_critics(next_q: Array, ddof: int = 1) -> Array:
-    """The disagreement of the ensemble, [N, B] -> [B].
-
-    `ddof=1` divides by N - 1, as torch's `std` and with it the authors' released code do.
+    """The disagreement of the ensemble, [N, B] -> [B]. `ddof=1` divides by N - 1, as the authors' code does (torch).
 
     Raises:
-      ValueError: fewer than two critics (nothing can disagree) or `ddof` not below N.
+      ValueError: fewer than two critics, or `ddof` not below N.
     """
     ensemble_size = next_q.shape[0]
     if ensemble_size < 2:
@@ -73,10 +67,7 @@ def no_penalty(next_q: Array, *, coef: Array | float = 0.0, ddof: int = 1) -> Ar
 
 
 def batch_std(next_q: Array, *, coef: Array | float, ddof: int = 1, axis_name: str | None = None) -> Array:
-    """SQT's penalty (eq. 20), one scalar for the batch: [N, B] -> []
-
-    `axis_name` names the mapped axis over which a batch is split, if it is.
-    """
+    """SQT's penalty (eq. 20): [N, B] -> []. `axis_name` is the mapped axis over which a batch is split, if it is."""
     disagreement = jnp.mean(std_over_critics(next_q, ddof))
     if axis_name is not None:
         disagreement = jax.lax.pmean(disagreement, axis_name)
@@ -84,7 +75,7 @@ def batch_std(next_q: Array, *, coef: Array | float, ddof: int = 1, axis_name: s
 
 
 def transition_std(next_q: Array, *, coef: Array | float, ddof: int = 1) -> Array:
-    """SQT-tuple's penalty (eq. 19), one value per transition: [N, B] -> [B]"""
+    """SQT-tuple's penalty (eq. 19): [N, B] -> [B]"""
     return coef * std_over_critics(next_q, ddof)
 
 

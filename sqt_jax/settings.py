@@ -8,6 +8,7 @@ The command line's flags, `--help`, YAML files, config.json, limits and "has no 
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple, get_type_hints
 
 # The device holds int32 and float32.
@@ -42,6 +43,7 @@ class Setting(NamedTuple):
     flag: str | None = None  # the flag that sets it; None: the algorithm's name does
     auto: str | None = None  # the switch that the word `auto` turns on instead
     default_text: str = ""  # what `--help` shows if the default depends on other things
+    formerly: str | None = None  # its name in older files
 
     def expects(self) -> str:
         """What its values are, in words: `a whole number of at least 1`."""
@@ -98,6 +100,12 @@ def settings_of(config: type) -> dict[str, Setting]:
         for field in dataclasses.fields(config)
         if _KEY in field.metadata
     }
+
+
+def current_names(settings: Mapping[str, Any], known: Mapping[str, Setting]) -> dict[str, Any]:
+    """Settings of an older file under the names of today."""
+    renamed = {about.formerly: name for name, about in known.items() if about.formerly}
+    return {renamed.get(name, name): value for name, value in settings.items()}
 
 
 def _brief(value: Any) -> str:

@@ -168,7 +168,11 @@ def test_every_row_makes_a_whole_run(algo):
     assert history.returns.shape == (3, 3, 2)
     assert state.gradient_steps.shape == (3,)
     needed = {"critic_loss", "actor_loss", "q_mean", "q_std", "penalty", "td_target", "td_error", "train_return"}
-    own = {td3: set(), sac: {"temperature", "entropy"}, td7: {"encoder_loss", "assessments", "checkpoint_refreshes"}}
+    own = {
+        td3: set(),
+        sac: {"temperature", "entropy"},
+        td7: {"encoder_loss", "assessments", "policy_checkpoint_refreshes"},
+    }
     assert needed | own[NAMES[algo]] <= set(history.metrics)
     assert all(value.shape == (3, 3) for value in history.metrics.values())
 

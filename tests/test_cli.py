@@ -62,7 +62,7 @@ def test_td7_tells_of_its_checkpoints(preset, tmp_path):
     assert evaluations[-1]["gradient_steps"] == ("180" if preset == "released" else "90")
     last = metrics[-1]
     # Episodes of 5 steps from step 30 to 120; each is an assessment, and all returns are equal, which is good enough.
-    assert (last["env_steps"], last["assessments"], last["checkpoint_refreshes"]) == ("120", "18.0", "18.0")
+    assert (last["env_steps"], last["assessments"], last["policy_checkpoint_refreshes"]) == ("120", "18.0", "18.0")
     assert float(last["best_min_return"]) == float(last["train_return"])
 
 

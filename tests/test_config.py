@@ -40,7 +40,11 @@ def test_defaults_of_td7_are_its_papers():
     agent = make_config("td7", "ant").agent
     assert (agent.embedding_size, agent.target_update_period) == (256, 250)
     assert (agent.priority_exponent, agent.min_priority) == (0.4, 1.0)
-    assert (agent.checkpoint_switch, agent.assessment_episodes, agent.checkpoint_reset_weight) == (750_000, 20, 0.9)
+    assert (agent.policy_checkpoint_switch, agent.assessment_episodes, agent.policy_checkpoint_reset_weight) == (
+        750_000,
+        20,
+        0.9,
+    )
 
 
 def user(settings):
@@ -94,10 +98,10 @@ REFUSED = [
     ("priority_exponent", {"priority_exponent": -0.4}),
     ("min_priority", {"min_priority": -1.0}),
     ("min_priority", {"min_priority": 0.0}),
-    ("checkpoint_switch", {"checkpoint_switch": -1}),
-    ("checkpoint_switch", {"checkpoint_switch": 7.5e5}),
+    ("policy_checkpoint_switch", {"policy_checkpoint_switch": -1}),
+    ("policy_checkpoint_switch", {"policy_checkpoint_switch": 7.5e5}),
     ("assessment_episodes", {"assessment_episodes": 0}),
-    ("checkpoint_reset_weight", {"checkpoint_reset_weight": 1.1}),
+    ("policy_checkpoint_reset_weight", {"policy_checkpoint_reset_weight": 1.1}),
     ("steps", {"steps": 0}),
     ("steps", {"steps": 2**31}),
     ("physics", {"physics": "bullet"}),
@@ -153,7 +157,12 @@ def test_every_setting_says_what_it_is_and_expects():
         {"ddof": 0},
         {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5},
         {"num_envs": 8, "replay_capacity": 1_001},
-        {"checkpoint_switch": 0, "assessment_episodes": 1, "priority_exponent": 0.0, "checkpoint_reset_weight": 1.0},
+        {
+            "policy_checkpoint_switch": 0,
+            "assessment_episodes": 1,
+            "priority_exponent": 0.0,
+            "policy_checkpoint_reset_weight": 1.0,
+        },
         {"steps": 256, "warmup_steps": 255, "eval_every": 1000},
     ],
     ids=str,
@@ -184,7 +193,7 @@ def test_a_plain_algorithm_may_have_one_critic():
         ("td3", {"temperature": 0.1}),
         ("td3_sqt", {"priority_exponent": 0.5}),
         ("sac", {"exploration_noise": 0.2}),
-        ("maxmin", {"checkpoint_switch": 5}),
+        ("maxmin", {"policy_checkpoint_switch": 5}),
         ("sac", {"penalty_inside_gamma": False}),
         ("td7", {"tau": 0.01}),
         ("td7_sqt", {"temperature": 0.1}),
@@ -280,7 +289,7 @@ CONFIGS = [
     make_config("sac_sqt_tuple", "humanoid", penalty_coef=0.3, hidden=(64,), num_envs=4, ensemble_size=5, ddof=0),
     make_config("sac", "cheetah", learn_temperature=True, reduce="subset_min", steps=50_000),
     make_config("redq_sqt", "ant", updates_per_step=3),
-    make_config("td7_sqt_tuple", "cheetah", target_update_period=100, checkpoint_switch=5_000),
+    make_config("td7_sqt_tuple", "cheetah", target_update_period=100, policy_checkpoint_switch=5_000),
 ]
 
 
@@ -311,6 +320,11 @@ def test_no_setting_has_two_owners():
 )
 def test_the_replay_is_no_larger_than_the_run_and_whole_inserts_fit(settings, capacity):
     assert make_config("td3", "ant", **settings).train.capacity == capacity
+
+
+def test_a_file_with_a_settings_former_name_is_read():
+    config = make_config("td7", "ant", checkpoint_switch=5, checkpoint_reset_weight=0.5)
+    assert config == make_config("td7", "ant", policy_checkpoint_switch=5, policy_checkpoint_reset_weight=0.5)
 
 
 def test_scalars_are_the_settings_of_their_names():

@@ -105,10 +105,12 @@ def test_help_wins_over_everything_else(word):
 
 
 def test_td7s_settings_are_parsed():
-    assert parse("--target_update_period=100", "--priority_exponent=0.5", "--checkpoint_switch=1e5").settings == {
+    assert parse(
+        "--target_update_period=100", "--priority_exponent=0.5", "--policy_checkpoint_switch=1e5"
+    ).settings == {
         "target_update_period": 100,
         "priority_exponent": 0.5,
-        "checkpoint_switch": 100_000,
+        "policy_checkpoint_switch": 100_000,
     }
 
 

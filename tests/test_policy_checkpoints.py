@@ -10,7 +10,7 @@ from sqt_jax.agents.td7 import Policy
 from sqt_jax.config import AgentConfig
 
 SWITCH = 4
-CONFIG = AgentConfig(checkpoint_switch=SWITCH, assessment_episodes=3)
+CONFIG = AgentConfig(policy_checkpoint_switch=SWITCH, assessment_episodes=3)
 
 
 def same(a, b):

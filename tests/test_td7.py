@@ -27,7 +27,7 @@ CONFIG = AgentConfig(
     penalty_coef=0.5,
     policy_delay=1,
     target_update_period=PERIOD,
-    checkpoint_switch=SWITCH,
+    policy_checkpoint_switch=SWITCH,
     assessment_episodes=3,
     exploration_noise=0.0,
 )
@@ -309,10 +309,10 @@ def test_episodes_of_several_environments_are_refused(three_policies):
 
 def test_the_status_has_policy_checkpoints_and_bounds(three_policies):
     status = VIEWS.status(three_policies)
-    assert status["assessments"] == status["checkpoint_refreshes"] == 0 and np.isnan(status["best_min_return"])
+    assert status["assessments"] == status["policy_checkpoint_refreshes"] == 0 and np.isnan(status["best_min_return"])
     state = checkpointed()._replace(learner=open_bounds(init(), -3.0, 4.0))
     status = VIEWS.status(AGENT.observe(state, jnp.array([5.0]), jnp.array([True]), 0))
-    named = ("assessments", "checkpoint_refreshes", "best_min_return", "value_low", "value_high")
+    named = ("assessments", "policy_checkpoint_refreshes", "best_min_return", "value_low", "value_high")
     assert [float(status[name]) for name in named] == [1, 1, 5, -3, 4]
 
 
@@ -396,7 +396,7 @@ def test_each_training_episode_is_assessed_by_the_rule(trained):
             refreshes[i] += better
             assert same(new.checkpoint, old.snapshot if better else old.checkpoint)
             assert not same(new.snapshot, old.snapshot)  # refreshed from a learner that goes on learning
-        np.testing.assert_array_equal(metrics["checkpoint_refreshes"], refreshes)
+        np.testing.assert_array_equal(metrics["policy_checkpoint_refreshes"], refreshes)
         np.testing.assert_array_equal(metrics["best_min_return"], best)
     assert np.any(refreshes < 12) and np.all(refreshes >= 2)  # both cases were seen
 

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,6 @@ from sqt_jax import q_targets
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_step, overflows
 from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
-
-AgentState = TypeVar("AgentState", bound=Any)
 
 LARGEST_VALUE = 1e9  # a larger |Q| is a divergence, long before it is infinite: no task here has returns near it
 
@@ -52,24 +50,21 @@ def squared_error(q: Array, td_target: Array) -> Array:
 
 def update(
     config: AgentConfig,
-    state: AgentState,
+    state: Any,
     q_values: Callable[[Params], Array],
     target: Array,
     terms: dict[str, Array],
     loss: Callable[[Array, Array], Array] = squared_error,
-) -> tuple[AgentState, Array, Metrics]:
-    """One Adam step of all critics towards the target.
+) -> tuple[Any, Array, Metrics]:
+    """One Adam step of all critics towards `td_target`'s target [B], with metrics; `q_std` is SQT's eq. 18.
+
+    If the loss or a gradient is not finite or a value exceeds `LARGEST_VALUE`, the agent has diverged: the critics stay
+    as they were and td_error is 0.
 
     Args:
       state: with the fields `critic`, `critic_opt`, `scalars` and `diverged`.
       q_values: parameters -> q [N, B], the critics at the batch's (s, a).
-      target, terms: from `td_target`.
       loss: (q [N, B], target [B]) -> [].
-
-    Returns:
-      The state, td_error [B] (`types.Update`) and metrics. `q_std` is the paper's eq. 18: the mean over the batch of
-      the std over the critics. If the loss or a gradient is not finite or a value exceeds `LARGEST_VALUE`, the agent
-      has diverged: the critics stay as they were, and td_error is 0.
     """
 
     def loss_fn(params):
@@ -81,11 +76,11 @@ def update(
     diverged = state.diverged | ~in_bounds | overflows(grads)
     critic, critic_opt = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr, diverged)
     td_error = jnp.where(diverged, 0.0, jnp.max(jnp.abs(q - target), axis=0))
-    several = config.ensemble_size > 1
+    disagreement = q_targets.std_over_critics(q, config.ddof) if len(q) > 1 else jnp.nan
     metrics = {
         "critic_loss": loss_value,
         "q_mean": jnp.mean(q),
-        "q_std": jnp.mean(q_targets.std_over_critics(q, config.ddof)) if several else jnp.full((), jnp.nan),
+        "q_std": jnp.mean(disagreement),
         "td_error": jnp.mean(td_error),
         "td_target": jnp.mean(target),
         "penalty": jnp.mean(terms["penalty"]),

@@ -52,11 +52,11 @@ def assess(
 
     Args:
       learner: the next snapshot.
-      step: [] int32, updates done so far. Before `checkpoint_switch` an assessment is one episode, then
+      step: [] int32, updates done so far. Before `policy_checkpoint_switch` an assessment is one episode, then
         `assessment_episodes`.
       episode_return: [], of the episode if it `ended` [] bool; otherwise nothing changes.
     """
-    late = step >= config.checkpoint_switch
+    late = step >= config.policy_checkpoint_switch
     episodes = state.episodes + 1
     min_return = jnp.minimum(state.min_return, episode_return)
     worse = min_return < state.best_min_return
@@ -82,8 +82,8 @@ def assess(
 
 def lower_best(config: AgentConfig, state: PolicyCheckpoints, step: Array) -> PolicyCheckpoints:
     """At the switch, once: the best minimum is of one episode, and the minimum of several is harder to reach."""
-    at_switch = step == config.checkpoint_switch
-    lowered = state.best_min_return * config.checkpoint_reset_weight
+    at_switch = step == config.policy_checkpoint_switch
+    lowered = state.best_min_return * config.policy_checkpoint_reset_weight
     return state._replace(best_min_return=jnp.where(at_switch, lowered, state.best_min_return))
 
 
@@ -91,7 +91,7 @@ def status(state: PolicyCheckpoints) -> Metrics:
     """Counts and the best minimum, [] each; NaN before the first refresh."""
     return {
         "assessments": state.assessments,
-        "checkpoint_refreshes": state.refreshes,
+        "policy_checkpoint_refreshes": state.refreshes,
         "best_min_return": jnp.where(state.refreshes > 0, state.best_min_return, jnp.nan),
     }
 

@@ -89,9 +89,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return critics.update(config, state, q_values, *td_target(state, batch, draws))
 
     def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
-        """The deterministic policy gradient (eq. 2) of the critics' mean."""
-
-        def loss_fn(actor):
+        def loss_fn(actor):  # the deterministic policy gradient, eq. 2
             q = critic_net.apply(state.critic, batch.obs, actor_net.apply(actor, batch.obs))
             return -jnp.mean(q_targets.ACTOR_REDUCTIONS[config.actor_reduce](q))
 
@@ -112,11 +110,8 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
             state, actor_loss = update_actor(state, batch)
             return update_targets(state), actor_loss
 
-        def skip(state):
-            return state, jnp.full((), jnp.nan)  # not measured
-
         actor_due = (step + 1) % config.policy_delay == 0  # members share it: a real branch under vmap
-        state, actor_loss = jax.lax.cond(actor_due, delayed, skip, state)
+        state, actor_loss = jax.lax.cond(actor_due, delayed, lambda state: (state, jnp.nan), state)
         return state, td_error, metrics | {"actor_loss": actor_loss}
 
     views = Views(
