@@ -7,7 +7,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.networks import Dense, hidden_layers
+from sqt_jax.networks import Dense, Network, hidden_layers
 from sqt_jax.types import Array
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # SAC's
@@ -51,3 +51,9 @@ class GaussianActor(nn.Module):
         mean = Dense(self.action_size, name="mean")(x)
         log_std = Dense(self.action_size, name="log_std")(x)
         return Gaussian(mean, clip_log_std(log_std))
+
+
+def gaussian_actor(action_size: int, hidden: Sequence[int]) -> Network:
+    """obs [B, O] -> a `Gaussian` of [B, A]"""
+    module = GaussianActor(action_size, hidden)
+    return Network(init=module.init, apply=module.apply)

@@ -11,18 +11,13 @@ import numpy as np
 from sqt_jax.types import Array, Params
 
 
-class Network(NamedTuple):
-    """The two functions of a module that are used."""
-
+class Network(NamedTuple):  # what is used of a flax module
     init: Callable[..., Params]  # (key, *inputs) -> parameters
     apply: Callable[..., Any]  # (parameters, *inputs) -> outputs
 
 
 class Dense(nn.Module):
-    """A linear layer of several inputs, initialised as torch does, U(±1/sqrt(fan_in)).
-
-    Each input has a matrix product of its own: one without a gradient costs none in the backward pass.
-    """
+    """A linear layer of several inputs with a matrix product each; torch's initialisation, U(±1/sqrt(fan_in))."""
 
     features: int
 
@@ -31,8 +26,8 @@ class Dense(nn.Module):
         widths = [x.shape[-1] for x in inputs]
         bound = sum(widths) ** -0.5
 
-        def uniform(key, shape, dtype=jnp.float32):
-            return jax.random.uniform(key, shape, dtype, -bound, bound)
+        def uniform(key, shape):
+            return jax.random.uniform(key, shape, jnp.float32, -bound, bound)
 
         kernel = self.param("kernel", uniform, (sum(widths), self.features))
         bias = self.param("bias", uniform, (self.features,))
@@ -70,20 +65,17 @@ class Critic(nn.Module):
         return Dense(1, name=f"layer{len(self.hidden)}")(x)[..., 0]
 
 
-def network(module: nn.Module) -> Network:
-    return Network(module.init, module.apply)
-
-
 def ensemble(module: type[nn.Module], ensemble_size: int, hidden: Sequence[int]) -> Network:
     """N independent modules as one: parameters and outputs get a leading axis N, inputs are shared."""
     axes: dict[str, Any] = {"variable_axes": {"params": 0}, "split_rngs": {"params": True}}
-    made = nn.vmap(module, in_axes=0, out_axes=0, axis_size=ensemble_size, **axes)(hidden)
+    made = nn.vmap(module, axis_size=ensemble_size, **axes)(hidden)
 
-    def each(function: Callable[..., Any]) -> Callable[..., Any]:
-        # A copy of the inputs for each module: one product with all first layers would make XLA transpose its result.
-        def call(key_or_params: Any, *inputs: Array) -> Any:
-            return function(key_or_params, *(jnp.broadcast_to(x, (ensemble_size, *x.shape)) for x in inputs))
+    def copies(
+        inputs: Sequence[Array],
+    ) -> list[Array]:  # with shared inputs XLA would transpose the first layer's result
+        return [jnp.broadcast_to(x, (ensemble_size, *x.shape)) for x in inputs]
 
-        return call
-
-    return Network(each(made.init), each(made.apply))
+    return Network(
+        init=lambda key, *inputs: made.init(key, *copies(inputs)),
+        apply=lambda params, *inputs: made.apply(params, *copies(inputs)),
+    )

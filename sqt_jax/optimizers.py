@@ -1,7 +1,4 @@
-"""Adam with a traced learning rate, and the soft update of target networks. Neither moves once an agent diverged.
-
-The choice is made number by number inside the step and costs no copy.
-"""
+"""Adam with a traced learning rate, and the soft update of target networks. Neither moves once an agent diverged."""
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +13,15 @@ adam_init = _adam.init  # parameters -> moments
 
 def adam_step(
     params: Params, opt_state: optax.OptState, grads: Params, lr: Array | float, diverged: Array
-) -> tuple[Params, optax.OptState]:
-    """One step of Adam, or none where `diverged` []. `lr` may be traced."""
+) -> tuple[Params, optax.OptState, Array]:
+    """One step of Adam, unless `diverged` [] or the gradients are not finite or too large to be squared.
+
+    Returns the parameters, the optimizer's state and whether the agent has diverged now.
+    """
+    diverged = diverged | ~jnp.isfinite(optax.tree.norm(grads, squared=True))
     direction, moments = _adam.update(grads, opt_state)
     moved = optax.apply_updates(params, jax.tree.map(lambda d: -lr * d, direction))
-    return trees.where(diverged, (params, opt_state), (moved, moments))
-
-
-def overflows(grads: Params) -> Array:
-    """[] bool: whether a gradient is not finite, or too large for Adam to square it."""
-    return ~jnp.isfinite(optax.tree.norm(grads, squared=True))
+    return *trees.where(diverged, (params, opt_state), (moved, moments)), diverged
 
 
 def soft_update(target: Params, online: Params, tau: Array | float, diverged: Array) -> Params:

@@ -5,13 +5,8 @@
     penalty         = coef * mean_b std_i Q_i(s'_b, a'_b)      SQT        (paper eq. 20: one scalar per batch)
                     = coef * std_i Q_i(s', a')                 SQT-tuple  (paper eq. 19: one value per transition)
 
-Everything expects the whole batch, `next_q [N, B]` of the N *target* critics at (s', a'): SQT's penalty is a mean over
-the batch. Penalties and reductions are functions of `next_q`; bind their settings with `functools.partial`:
-
-    penalty = functools.partial(q_targets.batch_std, coef=0.5)
-    y = q_targets.td_target(reward, discount, next_q, gamma=0.99, penalty=penalty)
-
-A new one is a function here and its row in `PENALTIES` or `REDUCTIONS` below.
+Penalties and reductions are functions of `next_q [N, B]`, the N *target* critics at (s', a') of the whole batch. A new
+one is a function here and its row in `PENALTIES` or `REDUCTIONS`. Bind their settings: `partial(batch_std, coef=0.5)`.
 """
 
 from collections.abc import Callable
@@ -20,9 +15,7 @@ import jax
 import jax.numpy as jnp
 
 Array = jax.Array
-Reduction = Callable[[Array], Array]  # next_q [N, B] -> [B]
-Penalty = Callable[[Array], Array]  # next_q [N, B] -> [B] or []
-Formula = Callable[..., Array]  # either, with settings to be bound
+Formula = Callable[..., Array]  # a penalty, next_q [N, B] -> [] or [B], or a reduction, next_q [N, B] -> [B]
 
 
 def min_over_critics(next_q: Array) -> Array:
@@ -92,7 +85,7 @@ REDUCTIONS: dict[str, Formula] = {
     "subset_min": min_over_subset,
 }
 # The setting `actor_reduce`: what the actor maximises of the critics at its own action, [N, B] -> [B].
-ACTOR_REDUCTIONS: dict[str, Reduction] = {
+ACTOR_REDUCTIONS: dict[str, Formula] = {
     "mean": mean_over_critics,  # paper eq. 9
     "min": min_over_critics,  # SAC's paper
     "first": lambda q: q[0],  # TD3's paper
@@ -105,28 +98,22 @@ def td_target(
     next_q: Array,
     *,
     gamma: Array | float,
-    reduce: Reduction = min_over_critics,
-    penalty: Penalty = no_penalty,
+    reduce: Formula = min_over_critics,
+    penalty: Formula = no_penalty,
     entropy_term: Array | float = 0.0,
     value_bounds: tuple[Array, Array] | None = None,
     penalty_inside_gamma: bool = True,
 ) -> Array:
-    """The TD target of all variants, without gradient.
+    """The TD target [B] of all variants, without gradient.
 
     Args:
       reward: [B].
       discount: [B], 0 where the episode terminated, else 1.
       next_q: [N, B], the target critics at (s', a').
-      gamma: discount factor.
-      reduce: [N, B] -> [B], how N values become one.
-      penalty: [N, B] -> [] or [B], what is subtracted.
-      entropy_term: [B], SAC's temperature * log pi(a'|s'), subtracted.
+      entropy_term: [B], SAC's temperature * log pi(a'|s').
       value_bounds: (low, high) between which the reduced value is clipped, before anything is subtracted (TD7).
-      penalty_inside_gamma: discounted and masked with the value (eqs. 19, 20); else subtracted outside, from every
-        target, terminal ones too (as eqs. 4 and 8 are printed).
-
-    Returns:
-      [B].
+      penalty_inside_gamma: discounted and masked with the value (eqs. 19, 20); else subtracted from every target,
+        terminal ones too (as eqs. 4 and 8 are printed).
 
     Raises:
       ValueError: shapes that would broadcast silently. Under `jax.vmap`, map over members, never over transitions:
@@ -134,8 +121,8 @@ def td_target(
     """
     shape = next_q.shape[1:]
     if next_q.ndim != 2 or not jnp.shape(reward) == jnp.shape(discount) == shape:
-        given = f"{next_q.shape}, {jnp.shape(reward)} and {jnp.shape(discount)}"
-        raise ValueError(f"next_q, reward and discount have to be [N, B], [B] and [B], not {given}")
+        shapes = next_q.shape, jnp.shape(reward), jnp.shape(discount)
+        raise ValueError(f"next_q, reward and discount have to be [N, B], [B] and [B], not {shapes}")
     value = reduce(next_q)
     if value_bounds is not None:
         value = jnp.clip(value, *value_bounds)

@@ -12,7 +12,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from sqt_jax.gaussian import Gaussian, clip_log_std
-from sqt_jax.networks import Dense, Network, ensemble, network
+from sqt_jax.networks import Dense, Network, ensemble
 from sqt_jax.types import Array, Params
 
 
@@ -101,7 +101,8 @@ def encoder(embedding_size: int, hidden: Sequence[int]) -> EncoderNetwork:
 
 def sale_actor(action_size: int, hidden: Sequence[int], gaussian: bool = False) -> Network:
     """obs [B, O], zs [B, Z] -> action [B, A] in (-1, 1), or a `Gaussian` of [B, A]"""
-    return network(SaleActor(action_size, hidden, gaussian))
+    module = SaleActor(action_size, hidden, gaussian)
+    return Network(init=module.init, apply=module.apply)
 
 
 def sale_critics(ensemble_size: int, hidden: Sequence[int]) -> Network:

@@ -229,12 +229,9 @@ def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
     axes = every_leaf(trainer.member_axes, jax.eval_shape(trainer.init, jax.random.key(0)))
     layout = layout or Layout(1)
 
-    def init(keys: Array, scalars: Scalars) -> TrainState:
-        return on_devices(*jax.tree.map(layout.filled, (keys, scalars)))
-
-    on_devices = layout.over_members(trainer.init, (0, 0), axes)
+    init = layout.over_members(trainer.init, (0, 0), axes)
     return Sweep(
-        init=jax.jit(init),
+        init=jax.jit(lambda *arguments: init(*jax.tree.map(layout.filled, arguments))),
         advance=jax.jit(layout.over_members(trainer.advance, (axes, None, None), axes), donate_argnums=0),
         evaluate=jax.jit(layout.over_members(trainer.evaluate, (axes,), 0)),
         measure=jax.jit(layout.over_members(trainer.measure, (axes,), 0)),

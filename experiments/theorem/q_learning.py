@@ -86,7 +86,7 @@ def weighted_double(t: Target, *, c: float) -> Array:
     return t.reward + t.gamma * t.discount * (beta * u[best] + (1 - beta) * v[best])
 
 
-def _of_all(t: Target, score: Array, penalty: q_targets.Penalty) -> Array:
+def _of_all(t: Target, score: Array, penalty: q_targets.Formula) -> Array:
     """The library's target at the action of the highest `score [A]`, as a batch of one transition."""
     chosen = t.next_q[:, jnp.argmax(score)][:, None]
     return q_targets.td_target(t.reward[None], t.discount[None], chosen, gamma=t.gamma, penalty=penalty)[0]

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from sqt_jax import q_targets
 from sqt_jax.config import AgentConfig
-from sqt_jax.optimizers import adam_step, overflows
-from sqt_jax.types import Array, Metrics, Params, Scalars, Transition
+from sqt_jax.optimizers import adam_step
+from sqt_jax.types import Array, Metrics, Params, Transition
 
 LARGEST_VALUE = 1e9  # a larger |Q| is a divergence, long before it is infinite: no task here has returns near it
 
@@ -23,19 +23,16 @@ def draw_subset(key: Array, config: AgentConfig) -> Array:
 
 
 def td_target(
-    config: AgentConfig, scalars: Scalars, batch: Transition, next_q: Array, subset: Array, **terms: Any
+    config: AgentConfig, state: Any, batch: Transition, next_q: Array, draws: Any, **terms: Any
 ) -> tuple[Array, dict[str, Array]]:
-    """The variant's td_target [B] from the target critics' next_q [N, B] at (s', a'), and its penalty, [] or [B].
-
-    `terms` are `entropy_term` and `value_bounds` of `q_targets.td_target`.
-    """
-    penalty = functools.partial(q_targets.PENALTIES[config.penalty], coef=scalars.penalty_coef, ddof=config.ddof)
+    """The variant's td_target [B] from next_q [N, B], and its penalty. `terms`: those of `q_targets.td_target`."""
+    penalty = functools.partial(q_targets.PENALTIES[config.penalty], coef=state.scalars.penalty_coef, ddof=config.ddof)
     target = q_targets.td_target(
         batch.reward,
         batch.discount,
         next_q,
-        gamma=scalars.gamma,
-        reduce=functools.partial(q_targets.REDUCTIONS[config.reduce], subset=subset),
+        gamma=state.scalars.gamma,
+        reduce=functools.partial(q_targets.REDUCTIONS[config.reduce], subset=draws.subset),
         penalty=penalty,
         penalty_inside_gamma=config.penalty_inside_gamma,
         **terms,
@@ -44,7 +41,7 @@ def td_target(
 
 
 def squared_error(q: Array, td_target: Array) -> Array:
-    """Sum over critics of the mean squared TD error: q [N, B], td_target [B] -> []."""
+    """The mean over the batch, summed over critics: q [N, B], td_target [B] -> []."""
     return jnp.sum(jnp.mean((q - td_target) ** 2, axis=-1))
 
 
@@ -62,7 +59,6 @@ def update(
     as they were and td_error is 0.
 
     Args:
-      state: with the fields `critic`, `critic_opt`, `scalars` and `diverged`.
       q_values: parameters -> q [N, B], the critics at the batch's (s, a).
       loss: (q [N, B], target [B]) -> [].
     """
@@ -73,14 +69,13 @@ def update(
 
     (loss_value, q), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.critic)
     in_bounds = jnp.isfinite(loss_value) & jnp.all(jnp.abs(q) < LARGEST_VALUE)  # a NaN is not
-    diverged = state.diverged | ~in_bounds | overflows(grads)
-    critic, critic_opt = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr, diverged)
+    diverged = state.diverged | ~in_bounds
+    critic, critic_opt, diverged = adam_step(state.critic, state.critic_opt, grads, state.scalars.lr, diverged)
     td_error = jnp.where(diverged, 0.0, jnp.max(jnp.abs(q - target), axis=0))
-    disagreement = q_targets.std_over_critics(q, config.ddof) if len(q) > 1 else jnp.nan
     metrics = {
         "critic_loss": loss_value,
         "q_mean": jnp.mean(q),
-        "q_std": jnp.mean(disagreement),
+        "q_std": jnp.mean(q_targets.std_over_critics(q, config.ddof) if len(q) > 1 else jnp.nan),
         "td_error": jnp.mean(td_error),
         "td_target": jnp.mean(target),
         "penalty": jnp.mean(terms["penalty"]),

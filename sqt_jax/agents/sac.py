@@ -14,8 +14,8 @@ import optax
 from sqt_jax import networks, q_targets
 from sqt_jax.agents import critic as critics
 from sqt_jax.config import AgentConfig
-from sqt_jax.gaussian import GaussianActor
-from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
+from sqt_jax.gaussian import gaussian_actor
+from sqt_jax.optimizers import adam_init, adam_step, soft_update
 from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
 
 
@@ -54,7 +54,7 @@ def temperature_loss(log_temperature: Array, log_prob: Array, target_entropy: fl
 
 def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
     """SAC for observations [B, O] and actions [B, A]."""
-    actor_net = networks.network(GaussianActor(action_size, config.hidden))
+    actor_net = gaussian_actor(action_size, config.hidden)
     critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden)
     target_entropy = -float(action_size)
 
@@ -95,7 +95,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         next_action, next_log_prob = actor_net.apply(state.actor, batch.next_obs).sample(draws.next_action_eps)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         entropy_term = temperature(state) * next_log_prob
-        target, terms = critics.td_target(config, state.scalars, batch, next_q, draws.subset, entropy_term=entropy_term)
+        target, terms = critics.td_target(config, state, batch, next_q, draws, entropy_term=entropy_term)
         return target, terms | {"next_log_prob": next_log_prob}
 
     def update_critic(state: SACState, batch: Transition, draws: SACDraws) -> tuple[SACState, Array, Metrics]:
@@ -113,16 +113,16 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
             return jnp.mean(temperature(state) * log_prob - value), log_prob
 
         (loss, log_prob), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
-        diverged = state.diverged | overflows(grads)
-        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
+        actor, actor_opt, diverged = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, state.diverged)
         metrics = {"actor_loss": loss, "entropy": -jnp.mean(log_prob), "temperature": temperature(state)}
         state = state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged)
         return update_temperature(state, log_prob) if config.learn_temperature else state, metrics
 
     def update_temperature(state: SACState, log_prob: Array) -> SACState:
         grad = jax.grad(temperature_loss)(state.log_temperature, log_prob, target_entropy)
-        diverged = state.diverged | overflows(grad)
-        log_temperature, opt = adam_step(state.log_temperature, state.temperature_opt, grad, state.scalars.lr, diverged)
+        log_temperature, opt, diverged = adam_step(
+            state.log_temperature, state.temperature_opt, grad, state.scalars.lr, state.diverged
+        )
         return state._replace(log_temperature=log_temperature, temperature_opt=opt, diverged=diverged)
 
     def update(state: SACState, batch: Transition, draws: SACDraws, step: Array) -> tuple[SACState, Array, Metrics]:

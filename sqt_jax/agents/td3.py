@@ -4,7 +4,7 @@ Differs from the paper: the actor maximises the critics' mean (SQT paper, eq. 9)
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import optax
 from sqt_jax import networks, q_targets
 from sqt_jax.agents import critic as critics
 from sqt_jax.config import AgentConfig
-from sqt_jax.optimizers import adam_init, adam_step, overflows, soft_update
+from sqt_jax.optimizers import adam_init, adam_step, soft_update
 from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
 
 
@@ -41,8 +41,7 @@ def explore(action: Array, key: Array, config: AgentConfig) -> Array:
 
 def smooth(action: Array, noise: Array, config: AgentConfig) -> Array:
     """Target policy smoothing (eqs. 14-15): the action [B, A] with clipped noise [B, A], in [-1, 1]."""
-    clipped = jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip)
-    return jnp.clip(action + clipped, -1.0, 1.0)
+    return jnp.clip(action + jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip), -1.0, 1.0)
 
 
 def draw(key: Array, batch: Transition, config: AgentConfig) -> TD3Draws:
@@ -54,7 +53,7 @@ def draw(key: Array, batch: Transition, config: AgentConfig) -> TD3Draws:
 
 def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
     """TD3 for observations [B, O] and actions [B, A]."""
-    actor_net = networks.network(networks.TanhActor(action_size, config.hidden))
+    actor_net: Any = networks.TanhActor(action_size, config.hidden)
     critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden)
 
     def init(key: Array, scalars: Scalars | None = None) -> TD3State:
@@ -80,7 +79,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         """The minimum over the target critics at the smoothed action (eq. 10), minus the penalty (SQT, eqs. 19-20)."""
         next_action = smooth(actor_net.apply(state.target_actor, batch.next_obs), draws.target_noise, config)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
-        return critics.td_target(config, state.scalars, batch, next_q, draws.subset)
+        return critics.td_target(config, state, batch, next_q, draws)
 
     def update_critic(state: TD3State, batch: Transition, draws: TD3Draws) -> tuple[TD3State, Array, Metrics]:
         def q_values(critic):
@@ -94,8 +93,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
             return -jnp.mean(q_targets.ACTOR_REDUCTIONS[config.actor_reduce](q))
 
         loss, grads = jax.value_and_grad(loss_fn)(state.actor)
-        diverged = state.diverged | overflows(grads)
-        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
+        actor, actor_opt, diverged = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, state.diverged)
         return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), loss
 
     def update_targets(state: TD3State) -> TD3State:

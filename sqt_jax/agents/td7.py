@@ -17,7 +17,7 @@ from sqt_jax import q_targets, sale, trees
 from sqt_jax.agents import critic as critics
 from sqt_jax.agents import policy_checkpoints, td3
 from sqt_jax.config import AgentConfig
-from sqt_jax.optimizers import adam_init, adam_step, overflows
+from sqt_jax.optimizers import adam_init, adam_step
 from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
 
 UNBOUNDED = 1e30  # far beyond `critic.LARGEST_VALUE`, and finite
@@ -179,9 +179,7 @@ def build_learner(
         zsa = encoder_net.zsa(state.fixed_encoder_target, zs, next_action)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action, zsa, zs)
         bounds = state.value_bounds.low, state.value_bounds.high
-        return critics.td_target(
-            config, state.scalars, batch, next_q, draws.subset, entropy_term=entropy_term, value_bounds=bounds
-        )
+        return critics.td_target(config, state, batch, next_q, draws, entropy_term=entropy_term, value_bounds=bounds)
 
     def update_encoder(state: TD7State, batch: Transition) -> tuple[TD7State, Metrics]:
         def loss_fn(encoder):
@@ -189,8 +187,9 @@ def build_learner(
             return encoder_loss(zsa, encoder_net.zs(encoder, batch.next_obs))
 
         loss, grads = jax.value_and_grad(loss_fn)(state.encoder)
-        diverged = state.diverged | overflows(grads)
-        encoder, encoder_opt = adam_step(state.encoder, state.encoder_opt, grads, state.scalars.lr, diverged)
+        encoder, encoder_opt, diverged = adam_step(
+            state.encoder, state.encoder_opt, grads, state.scalars.lr, state.diverged
+        )
         return state._replace(encoder=encoder, encoder_opt=encoder_opt, diverged=diverged), {"encoder_loss": loss}
 
     def update_critic(state: TD7State, batch: Transition, zs: Array, draws: Any) -> tuple[TD7State, Array, Metrics]:
@@ -214,8 +213,7 @@ def build_learner(
             return -jnp.mean(q_targets.ACTOR_REDUCTIONS[config.actor_reduce](q) - entropy_term), metrics
 
         (loss, metrics), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.actor)
-        diverged = state.diverged | overflows(grads)
-        actor, actor_opt = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, diverged)
+        actor, actor_opt, diverged = adam_step(state.actor, state.actor_opt, grads, state.scalars.lr, state.diverged)
         return state._replace(actor=actor, actor_opt=actor_opt, diverged=diverged), {"actor_loss": loss} | metrics
 
     def copy_targets(state: TD7State) -> TD7State:
