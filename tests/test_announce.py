@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from experiments.running.announce import Announcer, evaluation_share, final_table
+from experiments.running.announce import SHORT, Announcer, evaluation_share, final_table, what_to_expect
 
 MEMBER = {"member": 0, "seed": 7, "penalty_coef": 0.5, "final_return": 1.25, "best_return": 2.5, "q_std": 0.125}
 GROUP = {
@@ -33,6 +33,13 @@ def test_share_of_evaluation_of_the_full_protocol():
     text = evaluation_share(1_000_000, 201, 10, 1_000)
     assert "201 evaluations of 10 episodes" in text
     assert "up to 2,010,000 steps (67% of all)" in text
+
+
+def test_a_short_run_says_what_its_returns_mean():
+    assert "ant earns 1 per step" in what_to_expect("ant", 6_000) and "gets up to 1,000" in what_to_expect("ant", 6_000)
+    assert "up to 5,000" in what_to_expect("humanoid", 6_000)
+    assert not what_to_expect("cheetah", 6_000)  # it cannot fall
+    assert not what_to_expect("ant", SHORT) and not what_to_expect("brax:ant", 6_000)
 
 
 def test_final_table_has_the_members_and_the_groups(console):

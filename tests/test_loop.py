@@ -17,7 +17,7 @@ class Recorder:
         self.now, self.done = 0.0, 0
         self.calls, self.reports, self.statuses, self.messages = [], [], [], []
         self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate, measure=self.measure)
-        self.evaluated = lambda steps, returns: None
+        self.evaluated = lambda steps, returns, lengths, speeds: None
         self.update, self.message = self.statuses.append, self.messages.append
 
     def advance(self, state, steps, learn):

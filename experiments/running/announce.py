@@ -12,8 +12,12 @@ from experiments.running import resume
 from experiments.running.loop import Outcome
 from experiments.running.plan import Plan
 from experiments.running.progress import format_seconds
+from sqt_jax import envs
 from sqt_jax.algorithms import agent_of
+from sqt_jax.envs.gym_tasks import EPISODE_LENGTH
 from sqt_jax.train import evaluation_steps
+
+SHORT = 100_000  # env steps: results of shorter runs need an explanation
 
 
 class Announcer:
@@ -44,6 +48,8 @@ class Announcer:
         self._line(
             evaluation_share(train.steps, len(evaluation_steps(train)), episodes, plan.env.episode_length),
         )
+        if hint := what_to_expect(plan.config.env, train.steps):
+            self._line(hint)
         if every := plan.output["checkpoint_every"]:
             state, row = sizes
             self._line(
@@ -75,6 +81,19 @@ class Announcer:
 
     def _line(self, text: str) -> None:
         self.console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+def what_to_expect(env: str, steps: int) -> str:
+    """Why the returns of a short run mislead on a task that rewards staying upright; empty on others."""
+    task = envs.TASKS.get(env)
+    if steps >= SHORT or task is None or task.healthy is None:
+        return ""
+    still = task.alive * EPISODE_LENGTH
+    return (
+        f"what to expect: {env} earns {task.alive:g} per step for staying upright: a robot that can stand still gets up to "
+        f"{still:,.0f}. One that starts to move falls at first: length and return drop before they rise. {steps:,} "
+        f"steps are too few to learn to walk; speed shows whether it moves"
+    )
 
 
 def evaluation_share(steps: int, evaluations: int, episodes: int, episode_length: int) -> str:

@@ -152,7 +152,7 @@ def train_loop(
         show("evaluating" if pace.evaluations else "compiling the evaluation", done >= train.warmup_steps)
         before = clock()
         evaluation, bias = sweep.evaluate(state)
-        returns, lengths = of_members(evaluation.returns), of_members(evaluation.lengths)
+        returns, lengths, speeds = (of_members(leaf) for leaf in evaluation)
         pace.evaluated(clock() - before)
         bad = find_diverged(returns)
         # A diverged member is frozen: its return is not a result of the algorithm at this step.
@@ -161,7 +161,7 @@ def train_loop(
             last_return = float(np.nanmean(returns))
         send(returns, lengths, {name: np.where(bad, np.nan, of_members(value)) for name, value in bias.items()})
         evaluated = done
-        display.evaluated(done, returns[~bad].mean(axis=1))
+        display.evaluated(done, returns[~bad], lengths[~bad], speeds[~bad])
 
     def find_diverged(returns: np.ndarray | None) -> np.ndarray:
         """Which members have diverged, [S] bool; prints a message for each new one."""

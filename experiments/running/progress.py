@@ -116,11 +116,20 @@ class Display:
             )
         self._last_phase = status.phase
 
-    def evaluated(self, env_steps: int, returns: np.ndarray) -> None:
-        """Prints a line for an evaluation. `returns`: mean return of each member that has not diverged."""
-        if not self.quiet and len(returns):
-            spread = f" +- {returns.std():,.1f} over {len(returns)} members" if len(returns) > 1 else ""
-            self._line(f"step {env_steps:>9,}: return {returns.mean():,.1f}{spread}")
+    def evaluated(self, env_steps: int, returns: np.ndarray, lengths: np.ndarray, speeds: np.ndarray) -> None:
+        """Prints a line for an evaluation.
+
+        Args:
+          returns, lengths, speeds: [members, episodes] of the members that have not diverged; a speed (m/s) is NaN if
+            the task has none.
+        """
+        if self.quiet or not len(returns):
+            return
+        means = returns.mean(axis=1)
+        spread = f" +- {means.std():,.1f} over {len(means)} members" if len(means) > 1 else ""
+        speed = "" if np.isnan(speeds).all() else f", speed {np.nanmean(speeds):.2f} m/s"
+        length = f", length {lengths.mean():,.0f}{speed}"
+        self._line(f"step {env_steps:>9,}: return {means.mean():,.1f}{spread}{length}")
 
     def message(self, text: str) -> None:
         """Prints a line, even with --quiet."""
