@@ -90,8 +90,8 @@ def what_to_expect(env: str, steps: int) -> str:
         return ""
     still = task.alive * EPISODE_LENGTH
     return (
-        f"what to expect: {env} earns {task.alive:g} per step for staying upright: a robot that can stand still gets up "
-        f"to {still:,.0f}. One that starts to move falls at first: length and return drop before they rise. {steps:,} "
+        f"what to expect: {env} earns {task.alive:g} per step for staying upright: a robot that stands still gets up to "
+        f"{still:,.0f}. One that starts to move falls at first: length and return drop before they rise. {steps:,} "
         f"steps are too few to learn to walk; speed shows whether it moves"
     )
 
