@@ -184,6 +184,8 @@ def _check_env(env: str | Environment, physics: str | None, eval_physics: str) -
         if not isinstance(name, str) or not name:
             raise ConfigError("env", f"expects an environment with a name, not {name!r}")
         return name, OWN_PHYSICS, OWN_PHYSICS
+    if not isinstance(env, str):
+        raise ConfigError("env", f"expects a name or an Environment, not {type(env).__name__}")
     try:
         env = envs.resolve(env)
     except ValueError as error:
@@ -277,8 +279,11 @@ def env_of(config: Config, env: Environment | None = None) -> Environment:
     """The environment of an experiment: `env` if given, else the named one.
 
     Raises:
-      ValueError: the configuration is of an environment of your own, and `env` is missing or has another name.
+      ValueError: `env` is not an `Environment`; or the configuration is of an environment of your own, and `env` is
+        missing or has another name.
     """
+    if not isinstance(env, Environment | None):
+        raise ValueError(f"env: expects an Environment, not {type(env).__name__}")
     if config.physics == OWN_PHYSICS and (env is None or env.name != config.env):
         given = "none" if env is None else env.name
         raise ValueError(f"the configuration is of an environment of your own called {config.env}, given: {given}")

@@ -197,3 +197,14 @@ def test_the_replay_is_lap_for_td7_alone_with_the_agents_settings(algo):
     state = buffer.feedback(state, rows, jnp.zeros(2), jnp.int32(2))
     assert state.max_priority == 5
     assert buffer.feedback(state, rows, jnp.zeros(2), jnp.int32(3)).max_priority == 2  # refreshed every 3 updates
+
+
+def test_what_is_no_environment_is_rejected():
+    for env in (3, None, object()):
+        with pytest.raises(ConfigError, match="--env: expects a name or an Environment, not "):
+            make_config("td3", env)
+    config = make_config("td3", constant_reward())
+    with pytest.raises(ValueError, match="env: expects an Environment, not str"):
+        make_train(config, "point")
+    with pytest.raises(ValueError, match="an environment of your own called constant_reward, given: none"):
+        make_trainer(config)

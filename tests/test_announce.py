@@ -55,7 +55,9 @@ def test_final_table_has_the_members_and_the_groups(console):
 @pytest.mark.parametrize("quiet", [False, True])
 def test_an_interrupted_run_ends_with_the_command_that_resumes_it(console, tmp_path, quiet):
     path = tmp_path / "a run"
-    plan = SimpleNamespace(path=path, output={"checkpoint_every": 20}, options=SimpleNamespace(quiet=quiet))
+    plan = SimpleNamespace(
+        path=path, own_env=None, output={"checkpoint_every": 20}, options=SimpleNamespace(quiet=quiet)
+    )
     outcome = SimpleNamespace(interrupted=True, wall_seconds=83.0, steps_per_second=1234.0)
     Announcer(console, plan).end(outcome, SUMMARY, [], curves=True)
     lines = console.file.getvalue().splitlines()

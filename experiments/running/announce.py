@@ -77,7 +77,11 @@ class Announcer:
         if curves:
             self._line(f"curves: {self.plan.path / 'curves.png'}")
         if outcome.interrupted and self.plan.output["checkpoint_every"]:
-            self._line(f"resume with: python -m experiments.run --resume={shlex.quote(str(self.plan.path))}")
+            flag = f"--resume={self.plan.path}"
+            command = f"python -m experiments.run {shlex.quote(flag)}"
+            if self.plan.own_env:
+                command = f"experiments.run.main(['run', {flag!r}], env=env)"
+            self._line(f"resume with: {command}")
 
     def _line(self, text: str) -> None:
         self.console.print(text, soft_wrap=True, highlight=False, markup=False)
@@ -90,9 +94,9 @@ def what_to_expect(env: str, steps: int) -> str:
         return ""
     still = task.alive * EPISODE_LENGTH
     return (
-        f"what to expect: {env} earns {task.alive:g} per step for staying upright: a robot that stands still gets up to "
-        f"{still:,.0f}. One that starts to move falls at first: length and return drop before they rise. {steps:,} "
-        f"steps are too few to learn to walk; speed shows whether it moves"
+        f"what to expect: {env} earns {task.alive:g} per step for staying upright: up to {still:,.0f} for standing still. "
+        "A robot that starts to move falls at first: length and return drop before they rise. "
+        f"{steps:,} steps are too few to learn to walk; the speed shows whether it moves"
     )
 
 
