@@ -67,7 +67,7 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
       member: its number, from 0.
 
     Returns:
-      A compiled function obs [B, O] -> action [B, A] in [-1, 1].
+      A compiled function obs [B, O] -> action [B, A] in [-1, 1]. It raises ValueError for other sizes of obs.
 
     Raises:
       FileNotFoundError: the directory has no policy, or no such member.
@@ -86,6 +86,8 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
 
     @jax.jit
     def policy(obs: Array) -> Array:
+        if jnp.shape(obs)[-1:] != sizes[:1]:
+            raise ValueError(f"obs: expected [B, {sizes[0]}], got {list(jnp.shape(obs))}")
         return agent.views.policy_action(params, jnp.asarray(obs, jnp.float32))
 
     return policy

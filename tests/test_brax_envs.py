@@ -86,7 +86,7 @@ def test_every_environment_steps_on_each_of_its_physics(name):
     """Traced, not compiled."""
 
     def shapes(timestep):
-        # A list and a treedef: MJX's own classes hold NumPy arrays as constants, which `==` of the trees cannot compare.
+        # Not the trees themselves: MJX's classes hold NumPy arrays as constants, which their `==` cannot compare.
         leaves, structure = jax.tree.flatten(timestep)
         return [(leaf.shape, leaf.dtype) for leaf in leaves], structure
 
