@@ -86,9 +86,10 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
 
     @jax.jit
     def policy(obs: Array) -> Array:
-        if jnp.shape(obs)[-1:] != sizes[:1]:
-            raise ValueError(f"obs: expected [B, {sizes[0]}], got {list(jnp.shape(obs))}")
-        return agent.views.policy_action(params, jnp.asarray(obs, jnp.float32))
+        obs = jnp.asarray(obs, jnp.float32)
+        if obs.shape[-1:] != sizes[:1]:
+            raise ValueError(f"obs: expected [B, {sizes[0]}], got {list(obs.shape)}")
+        return agent.views.policy_action(params, obs)
 
     return policy
 

@@ -74,6 +74,11 @@ def test_an_environment_of_ones_own_from_start_to_end(tmp_path, monkeypatch, cap
         sqt_jax.evaluate_policy(policy, make_point(size=2), num_episodes=3)
 
 
+def test_a_command_line_without_the_programs_name_is_rejected(capsys):
+    assert run.main(ARGV[1:], env=make_point()) == 2
+    assert capsys.readouterr() == ("", "argv: expects the program's name first, not '--algo=td3_sqt'\n")
+
+
 def test_training_functions_need_the_environment_of_their_configuration():
     env = make_point()
     config = sqt_jax.make_config("td3_sqt", env)
