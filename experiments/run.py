@@ -20,6 +20,8 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
       env: an environment of your own, recorded and filed under `env.name`. `--env` is then not required.
     """
     try:
+        if argv and argv[0].startswith("--"):
+            raise UsageError(f"argv: expects the program's name first, not {argv[0]!r}")
         options = flags.parse(argv, needs_env=env is None)
         if options is None:
             print(flag_table.help_text())

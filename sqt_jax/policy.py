@@ -67,7 +67,7 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
       member: its number, from 0.
 
     Returns:
-      A compiled function obs [B, O] -> action [B, A] in [-1, 1].
+      A compiled function obs [B, O] -> action [B, A] in [-1, 1]. It raises ValueError for other sizes of obs.
 
     Raises:
       FileNotFoundError: the directory has no policy, or no such member.
@@ -86,7 +86,10 @@ def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Arr
 
     @jax.jit
     def policy(obs: Array) -> Array:
-        return agent.views.policy_action(params, jnp.asarray(obs, jnp.float32))
+        obs = jnp.asarray(obs, jnp.float32)
+        if obs.shape[-1:] != sizes[:1]:
+            raise ValueError(f"obs: expected [B, {sizes[0]}], got {list(obs.shape)}")
+        return agent.views.policy_action(params, obs)
 
     return policy
 

@@ -28,10 +28,13 @@ def write_run(
     Args:
       q_std: of all members and evaluations, or one per member.
       more: further columns by name, [members, evaluations] each.
-      settings: of the run; `swept={"penalty_coef": (0.1, 0.5)}` makes the seeds times these values.
+      settings: of the run; `swept={"penalty_coef": (0.1, 0.5)}` makes the seeds times these values, and
+        `sizes=(3, 2)` a run on an environment handed in from Python.
     """
     swept = settings.pop("swept", {})
     versions = settings.pop("versions", {"jax": "0.10.2"})
+    sizes = settings.pop("sizes", None)
+    settings |= {"physics": "own"} if sizes else {}
     settings = {"steps": STEPS, "warmup_steps": 10, "batch_size": 8, "eval_every": 50, "eval_episodes": 1} | settings
     configs = [make_config(algo, env, **settings)]
     if swept:
@@ -47,7 +50,7 @@ def write_run(
         "settings": configs[0].flat(),
         "preset": "paper",
         "replay_rows": configs[0].train.capacity,
-        "evaluated_on": configs[0].physics if env.startswith("brax:") else "mujoco",
+        "evaluated_on": configs[0].physics if sizes or env.startswith("brax:") else "mujoco",
         "swept": list(swept),
         "members": [
             {"member": index, "seed": seed, "penalty_coef": config.agent.penalty_coef}
@@ -59,6 +62,7 @@ def write_run(
         "versions": versions,
         "resumed": [],
     }
+    content |= {"own_env": {"observation_size": sizes[0], "action_size": sizes[1]}} if sizes else {}
     (path / "config.json").write_text(json.dumps(content))
     q_stds = np.broadcast_to(q_std, len(members))
     with (path / "evaluations.csv").open("w", newline="") as file:

@@ -41,6 +41,11 @@ def test_each_group_is_drawn_in_its_own_colour(tmp_path):
     assert pixels_of(image, COLOURS[2]) == 0
 
 
+def test_a_dollar_sign_in_a_name_starts_no_formula(tmp_path):
+    draw_curves(table_of([[0, 1]], [0.5]), tmp_path / "curves.png", r"td3 on $\frac$")
+    assert (tmp_path / "curves.png").exists()
+
+
 @pytest.mark.parametrize("curves", [[[1.0]], [[1.0, NAN, 2.0], [2.0, 3.0, NAN]], [[NAN, NAN]]])
 def test_short_and_broken_curves_are_drawn_without_complaint(tmp_path, curves, recwarn):
     draw_curves(table_of(curves, [0.5] * len(curves), q_std=NAN), tmp_path / "curves.png", "td3 on ant")

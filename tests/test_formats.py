@@ -77,3 +77,9 @@ def test_a_narrow_terminal_cuts_no_number():
 @pytest.mark.parametrize("name", FORMATS)
 def test_an_empty_table_can_be_written(name):
     assert FORMATS[name][1](TABLE._replace(sections=[], records=[], notes=[])).strip() or name == "csv"
+
+
+def test_a_tasks_name_is_no_markup():
+    table = TABLE._replace(header=["algorithm", "[/b]<i>|", "UTD"])
+    assert "[/b]<i>|" in terminal(table)
+    assert "| algorithm | [/b]&lt;i>\\| | UTD |" in markdown(table)

@@ -210,6 +210,8 @@ def test_an_environment_handed_in_names_the_folder(tmp_path, name, folder):
     ("name", "arguments", "message"),
     [
         ("", [], "^env: expects an environment with a name that can name a folder, not ''$"),
+        ("a\nb", [], r"^env: expects an environment with a name that can name a folder, not 'a\\nb'$"),
+        (5, [], "^env: expects an environment with a name that can name a folder, not 5$"),
         ("..", [], "^env: expects an environment with a name that can name a folder, not '..'$"),
         ("point", ["--env=ant"], "^--env=ant: expects 'point', the name of the environment handed in, or no --env$"),
         ("point", ["--physics=mjx"], "^--physics: has no effect with an environment handed in$"),
@@ -219,6 +221,13 @@ def test_an_environment_handed_in_names_the_folder(tmp_path, name, folder):
 def test_what_contradicts_an_environment_handed_in_is_rejected(tmp_path, name, arguments, message):
     with pytest.raises(flags.UsageError, match=message):
         own_plan(tmp_path, point(name), "--name=a", *arguments)
+
+
+@pytest.mark.parametrize("env", ["point", {"name": "point"}])
+def test_something_other_than_an_environment_is_rejected(tmp_path, env):
+    message = rf"^env: expects an Environment \(sqt_jax.make_environment\), not a {type(env).__name__}$"
+    with pytest.raises(flags.UsageError, match=message):
+        own_plan(tmp_path, env, "--name=a")
 
 
 def test_own_physics_needs_an_environment_handed_in(tmp_path):

@@ -27,6 +27,7 @@ def made(tmp_path_factory):
     path = write_run(folder, "td3", "hopper", [[0, 1], [0, 2]], seeds=(3, 5), hidden=(8, 8))
     add_policies(path, envs.make("hopper", "mujoco"), [1, 2])
     write_run(folder, "td3", "brax:inverted_pendulum", physics="spring", hidden=(8, 8))
+    write_run(folder, "td3", "cheetah", sizes=(17, 6))  # an environment from Python with the name of a task
     (folder / "results").mkdir()
     (folder / "results" / "table.md").write_text("none")
     return folder
@@ -45,6 +46,11 @@ def folder(made, tmp_path, monkeypatch):
 
 RUN = "runs/hopper/td3/run"
 BRAX = "runs/brax:inverted_pendulum/td3/run"
+OWN = "runs/cheetah/td3/run"
+BY_PYTHON = (
+    f"{OWN}: expects a run on one of the library's environments; this one's was handed in from Python: there, use "
+    f"sqt_jax.load_policy('{OWN}/policy') and sqt_jax.evaluate_policy(policy, env)"
+)
 
 
 @pytest.fixture
@@ -144,6 +150,8 @@ REJECTED = [
     (f"{BRAX} --video=film.mp4", "--video=film.mp4: expects a file with the ending .html, as brax:inverted_pendulum"),
     (f"{BRAX} --physics=mujoco", "--physics=mujoco: expects one of mjx, generalized, spring, positional"),
     (f"{BRAX} --camera=track", "--camera=track: Brax's viewer has its own"),
+    (OWN, BY_PYTHON),
+    (f"{OWN} --physics=mujoco --video=film.html", BY_PYTHON),
 ]
 
 

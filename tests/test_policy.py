@@ -68,6 +68,12 @@ def test_parameters_of_other_sizes_are_rejected(tmp_path):
         policy.load_policy(tmp_path / "policy")
 
 
+def test_observations_of_another_size_are_rejected(tmp_path):
+    saved("td3", tmp_path / "policy")
+    with pytest.raises(ValueError, match=r"^obs: expected \[B, 2\], got \[5, 3\]"):
+        policy.load_policy(tmp_path / "policy")(jnp.zeros((5, 3)))
+
+
 def test_a_missing_member_is_named(tmp_path):
     saved("td3", tmp_path / "policy")
     with pytest.raises(FileNotFoundError, match="member_7"):

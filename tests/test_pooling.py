@@ -28,6 +28,26 @@ def test_seeds_of_runs_with_equal_settings_are_pooled(tmp_path):
     assert group.notes == ()
 
 
+def test_own_environments_of_one_name_and_several_sizes_are_not_pooled(tmp_path):
+    for name, sizes in {"a": (1, 1), "b": (3, 2)}.items():
+        write_run(tmp_path, env="point", name=name, sizes=sizes)
+        write_run(tmp_path, "td3_sqt", env="point", name=name, sizes=sizes)
+    write_run(tmp_path, env="point", name="c", sizes=(3, 2), seeds=[1])
+    write_run(tmp_path, env="maze", sizes=(3, 2))
+    found = collect([str(tmp_path)])
+    assert found.tasks == ["maze", "point (obs 1, action 1)", "point (obs 3, action 2)"]
+    assert [row.label for row in found.rows] == ["td3", "td3_sqt"]
+    assert [(group.algo, group.env, group.seeds) for group in found.groups] == [
+        ("td3", "maze", (0,)),
+        ("td3", "point (obs 1, action 1)", (0,)),
+        ("td3", "point (obs 3, action 2)", (0, 1)),
+        ("td3_sqt", "point (obs 1, action 1)", (0,)),
+        ("td3_sqt", "point (obs 3, action 2)", (0,)),
+    ]
+    for group in found.groups[3:]:
+        assert found.baseline(group).group.env == group.env
+
+
 def test_the_same_seed_twice_is_rejected(tmp_path):
     one, two = write_run(tmp_path / "a", seeds=[3]), write_run(tmp_path / "b", seeds=[3])
     with pytest.raises(UsageError) as error:

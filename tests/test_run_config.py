@@ -120,6 +120,26 @@ def test_what_describes_no_run_is_rejected(tmp_path, change, message):
     assert len(str(error.value)) < 500
 
 
+@pytest.mark.parametrize(
+    ("settings", "own_env"),
+    [
+        ({}, {"observation_size": 3, "action_size": 2}),  # of a named task
+        ({"physics": "own"}, []),
+        ({"physics": "own"}, {"observation_size": 3}),
+        ({"physics": "own"}, {"observation_size": 3.0, "action_size": 2}),
+        ({"physics": "own"}, {"observation_size": 3, "action_size": 0}),
+        ({"physics": "own", "env": "\x1b[0m"}, {"observation_size": 3, "action_size": 2}),
+        ({"physics": "own", "env": "\x1b[0m"}, {}),
+    ],
+)
+def test_a_damaged_environment_of_ones_own_is_rejected(tmp_path, settings, own_env):
+    _, _, content = written(tmp_path, "plain")
+    content |= {"settings": content["settings"] | {"eval_physics": "auto"} | settings, "evaluated_on": None}
+    run_config.write(tmp_path, content | {"own_env": own_env})
+    with pytest.raises(run_config.InvalidRunConfig, match="does not describe a run"):
+        run_config.read(tmp_path)
+
+
 def test_what_json_has_no_word_for_is_not_written(tmp_path):
     _, _, content = written(tmp_path, "plain")
     with pytest.raises(ValueError):

@@ -84,6 +84,30 @@ def test_a_resumed_run_has_all_its_commands(tmp_path):
     assert fourth.text is None and "no command" in fourth.note
 
 
+def test_a_run_on_an_environment_from_python_is_repeated_in_python(tmp_path):
+    path = write_run(tmp_path, env="point", sizes=(3, 2), steps=60)
+    resumed = [{"env_steps": 60, "command": ["run.py", "--resume=x y"]}]
+    found = details(path, command=["", "--algo=td3", "--out=it's"], resumed=resumed)
+    words = "(in Python; env is the environment that was handed in)"
+    assert found.commands == [
+        ("experiments.run.main(['run', '--algo=td3', \"--out=it's\"], env=env)", f"Started with {words}", ""),
+        ("experiments.run.main(['run', '--resume=x y'], env=env)", f"Resumed at step 60 with {words}", ""),
+    ]
+    assert (found.env, found.physics) == ("point", "own")
+    assert not {"physics", "eval_physics"} & {setting.name for setting in found.settings}
+
+
+def test_an_environment_has_the_name_that_it_has_in_the_tables(tmp_path):
+    write_run(tmp_path, env="point", name="a", sizes=(1, 1))
+    write_run(tmp_path, env="point", name="b", sizes=(3, 2))
+    write_run(tmp_path, env="cheetah", sizes=(3, 2))
+    assert [run.env for run in run_details.read_all(collect([str(tmp_path)]))] == [
+        "cheetah (own)",
+        "point (obs 1, action 1)",
+        "point (obs 3, action 2)",
+    ]
+
+
 @pytest.mark.parametrize("command", [None, [], ["run"], "run --algo=td3", ["run", 3], {"a": 1}])
 def test_what_is_not_recorded_is_said(tmp_path, command):
     found = details(write_run(tmp_path), command=command, device=3)

@@ -1,6 +1,5 @@
 import json
 
-import pytest
 from made_runs import made_member, write_run
 from table_reader import cells
 
@@ -8,8 +7,6 @@ from experiments.evidence import figures, published, run_details
 from experiments.evidence.paper_tables import make_tables
 from experiments.evidence.pooling import arrange, collect, pool
 from experiments.evidence.task_sizes import read_sizes, table_1
-from sqt_jax.algorithms import make_config
-from sqt_jax.config import ConfigError
 
 
 def test_table_1_by_hand():
@@ -67,22 +64,19 @@ def test_all_tables_and_figures_are_made_of_own_environments():
     assert drawn["learning_curves"] and drawn["performance_profile"]
 
 
-def accepts_own_environments():
-    try:
-        make_config("td3", "point", physics="own")
-    except (ConfigError, ValueError):
-        return False
-    return True
-
-
-@pytest.mark.skipif(not accepts_own_environments(), reason="make_config does not accept physics own yet")
-def test_after_the_merge_runs_of_an_own_environment_are_read_from_disk(tmp_path):
-    path = write_run(tmp_path, env="point", physics="own")
-    content = json.loads((path / "config.json").read_text()) | {"evaluated_on": "own"}
-    (path / "config.json").write_text(json.dumps(content))
-    with_policy(path, observation_size=3, action_size=2)
+def test_runs_of_an_own_environment_are_read_from_disk(tmp_path):
+    write_run(tmp_path, env="point", sizes=(3, 2))
     runs = collect([str(tmp_path)])
     assert [group.env for group in runs.groups] == ["point"]
-    assert read_sizes(runs)[-1]["observation"] == 3
+    assert cells(table_1(read_sizes(runs), reference=False))[-1] == ["point", "own environment", "3", "2", "-"]
     (details,) = run_details.read_all(runs)
     assert "physics" not in [setting.name for setting in details.settings]
+
+
+def test_each_size_of_an_own_environment_has_its_line(tmp_path):
+    for name, sizes in {"a": (3, 2), "b": (1, 1)}.items():
+        write_run(tmp_path, env="point", name=name, sizes=sizes)
+    assert cells(table_1(read_sizes(collect([str(tmp_path)])), reference=False))[-2:] == [
+        ["point (obs 1, action 1)", "own environment", "1", "1", "-"],
+        ["point (obs 3, action 2)", "own environment", "3", "2", "-"],
+    ]

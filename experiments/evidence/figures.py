@@ -72,7 +72,8 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
     left.set_ylabel(LABELS["return_mean"])
     right.set_ylabel(LABELS["q_std"])
     left.legend(frameon=False, fontsize="small", loc="best")
-    figure.suptitle(f"{title}: mean and std (ddof 0) over seeds, thin lines: the seeds", fontsize="medium")
+    heading = f"{title}: mean and std (ddof 0) over seeds, thin lines: the seeds"
+    figure.suptitle(heading, fontsize="medium", parse_math=False)  # a dollar sign in a name starts no formula
     figure.savefig(path)
 
 

@@ -23,6 +23,7 @@ class MemberCurves(NamedTuple):
     settings: dict[str, Any]  # all by name, without the seed
     versions: dict[str, str]  # of the packages
     columns: dict[str, np.ndarray]  # [evaluations] each, in the order of the env steps
+    own_sizes: tuple[int, int] | None = None  # (observation, action) of an environment handed in from Python
 
 
 def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
@@ -83,6 +84,8 @@ def read_run(path: Path) -> list[MemberCurves]:
     except ValueError as error:
         raise UsageError(f"{path}: its evaluations.csv is damaged: {error}") from None
     evaluated_on = run.content.get("evaluated_on")
+    own_env = run.content.get("own_env")
+    own_sizes = (own_env["observation_size"], own_env["action_size"]) if own_env else None
     versions = {printable(name): printable(str(value)) for name, value in run.content["versions"].items()}
     found = []
     for index, (seed, settings) in enumerate(run.members):
@@ -105,7 +108,9 @@ def read_run(path: Path) -> list[MemberCurves]:
         diverged = np.isnan(own["return_mean"])
         critics = [name for name in ("q_mean", "q_std", "value_bias") if name in own]
         own |= {name: np.where(diverged, np.nan, own[name]) for name in critics}
-        found.append(MemberCurves(run=path, seed=seed, settings=settings, versions=versions, columns=own))
+        found.append(
+            MemberCurves(run=path, seed=seed, settings=settings, versions=versions, columns=own, own_sizes=own_sizes)
+        )
     if not set(columns["member"]) <= set(range(len(run.members))):
         raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that config.json does not have")
     return found

@@ -29,7 +29,7 @@ def rich_table(table: ResultTable) -> Group:
     """The table for a rich console."""
     shown = Table(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
     for name in table.header:
-        shown.add_column(name, overflow="fold")
+        shown.add_column(Text(name), overflow="fold")
     for lines in table.sections:
         for line in lines:
             shown.add_row(*(Text(_plain(cell)) for cell in line.cells), style="dim" if line.published else "")
@@ -49,11 +49,14 @@ def terminal(table: ResultTable, width: int = 200) -> str:
 def markdown(table: ResultTable) -> str:
     """The table as Markdown, with footnotes as superscripts."""
 
+    def words(text: str) -> str:
+        return text.replace("|", "\\|").replace("<", "&lt;")
+
     def text(cell: Cell) -> str:
-        lines = "<br>".join(line.replace("|", "\\|") for line in cell.lines)
+        lines = "<br>".join(map(words, cell.lines))
         return lines + (f" <sup>{_marks(cell)}</sup>" if cell.marks else "")
 
-    rows = [f"### {table.title}", "", f"| {' | '.join(table.header)} |", "|---" * len(table.header) + "|"]
+    rows = [f"### {table.title}", "", f"| {' | '.join(map(words, table.header))} |", "|---" * len(table.header) + "|"]
     for lines in table.sections:
         for line in lines:
             cells = [text(cell) for cell in line.cells]

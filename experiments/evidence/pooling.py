@@ -4,6 +4,7 @@
 - Any difference in a setting (a coefficient, the steps, the physics) makes another group.
 - Groups of one algorithm on one task become rows, labelled by the settings in which they differ.
 - An environment handed in from Python (physics `own`) is pooled under its own name, never with a task of the library.
+  Environments of one name and different sizes are different tasks.
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,7 +12,14 @@ from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import UsageError
 from experiments.evidence.finished_runs import MemberCurves, find, read_run
-from experiments.evidence.groups import PENALTY, Group, differences, differences_text, setting_text
+from experiments.evidence.groups import (
+    OWN_PHYSICS,
+    PENALTY,
+    Group,
+    differences,
+    differences_text,
+    setting_text,
+)
 from experiments.evidence.variants import baseline_of
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
@@ -104,7 +112,7 @@ def pool(curves: Iterable[MemberCurves]) -> list[Group]:
       UsageError: a group has a seed twice, or its seeds have no evaluation in common.
     """
     pools: dict[tuple, dict[int, MemberCurves]] = {}
-    for member in curves:
+    for member in _named_by_size([*curves]):
         seeds = pools.setdefault(tuple(sorted(member.settings.items())), {})
         if member.seed in seeds:
             algo, env = member.settings["algo"], member.settings["env"]
@@ -119,6 +127,23 @@ def pool(curves: Iterable[MemberCurves]) -> list[Group]:
             names = ", ".join(dict.fromkeys(str(member.run) for member in group.members))
             raise UsageError(f"{names}: the seeds of {group.algo} on {group.env} have no evaluation in common")
     return groups
+
+
+def _named_by_size(curves: Sequence[MemberCurves]) -> list[MemberCurves]:
+    """The members, with the sizes added to the name of an environment from Python that has several sizes here."""
+    sizes: dict[str, set[tuple[int, int] | None]] = {}
+    for member in curves:
+        if member.settings["physics"] == OWN_PHYSICS:
+            sizes.setdefault(member.settings["env"], set()).add(member.own_sizes)
+    found = []
+    for member in curves:
+        env = member.settings["env"]
+        if member.own_sizes and member.settings["physics"] == OWN_PHYSICS and len(sizes[env]) > 1:
+            observation, action = member.own_sizes
+            named = {"env": f"{env} (obs {observation}, action {action})"}
+            member = member._replace(settings=member.settings | named)
+        found.append(member)
+    return found
 
 
 def arrange(groups: Sequence[Group], notes: Sequence[str] = ()) -> Collected:

@@ -11,7 +11,7 @@ import numpy as np
 from experiments.evidence import run_settings
 from experiments.evidence.cells import NOTHING, number
 from experiments.evidence.finished_runs import MemberCurves
-from experiments.evidence.groups import OWN_PHYSICS, setting_text
+from experiments.evidence.groups import OWN_PHYSICS, Group, setting_text
 from experiments.evidence.pooling import Collected
 from experiments.evidence.run_settings import RunSettings
 from experiments.running import files
@@ -88,7 +88,7 @@ def read(path: Path, curves: Sequence[MemberCurves]) -> Details:
     return Details(
         path=path,
         algo=settings["algo"],
-        env=settings["env"],
+        env=Group(tuple(curves)).env,  # as in the tables
         seeds=tuple(dict.fromkeys(seed for seed, _ in run.members)),
         steps=settings["steps"],
         physics=settings["physics"],
@@ -96,7 +96,7 @@ def read(path: Path, curves: Sequence[MemberCurves]) -> Details:
         facts=_facts(content) | end,
         settings=_changed(run),
         versions={str(name): str(value) if value else "not installed" for name, value in content["versions"].items()},
-        commands=_commands(content),
+        commands=_commands(content, settings["physics"] == OWN_PHYSICS),
         swept=run.swept,
         members=[_returns(member, run.swept) for member in curves],
     )
@@ -155,14 +155,14 @@ def _changed(run: RunSettings) -> list[Setting]:
     ]
 
 
-def _commands(content: Mapping[str, Any]) -> list[Command]:
-    found = [_command(content, "Started with")]
+def _commands(content: Mapping[str, Any], own_env: bool) -> list[Command]:
+    found = [_command(content, "Started with", own_env)]
     versions = content["versions"]
     for entry in content["resumed"]:
         entry = entry if isinstance(entry, dict) else {}
         at = entry.get("env_steps")
         where = "" if type(at) is not int or at < 0 else f" at step {at:,}" if at else " from the start"
-        command = _command(entry, f"Resumed{where} with")
+        command = _command(entry, f"Resumed{where} with", own_env)
         own = entry.get("versions")
         other = {n: v for n, v in own.items() if v != versions.get(n)} if isinstance(own, dict) else {}
         if other:
@@ -172,14 +172,17 @@ def _commands(content: Mapping[str, Any]) -> list[Command]:
     return found
 
 
-def _command(entry: Mapping[str, Any], label: str) -> Command:
-    """A command line for a shell. Its first recorded word is the path of `experiments/run.py`."""
+def _command(entry: Mapping[str, Any], label: str, own_env: bool) -> Command:
+    """A command line for a shell, or a call in Python. Its first recorded word is the path of `experiments/run.py`."""
     words = entry.get("command")
     if not isinstance(words, list) or len(words) < 2 or not all(isinstance(word, str) for word in words):
         return Command(None, label, "config.json has no command that can be repeated.")
     note = ""
     if any(word.lstrip("-").partition("=")[0] == "config" for word in words[1:]):
         note = "It read flags from a file that is not recorded; the resulting settings are below."
+    if own_env:
+        label = f"{label} (in Python; env is the environment that was handed in)"
+        return Command(f"experiments.run.main({['run', *words[1:]]!r}, env=env)", label, note)
     return Command(shlex.join(["python", "-m", "experiments.run", *words[1:]]), label, note)
 
 

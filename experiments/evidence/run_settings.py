@@ -55,6 +55,8 @@ def _unknown_algorithm(content: dict[str, Any]) -> RunSettings:
         raise ValueError
     if not isinstance(content.get("evaluated_on", ""), str) or not 0 < len(content["members"]) <= MAX_MEMBERS:
         raise ValueError
+    if not run_config.is_valid_own_env(content.get("own_env", {}), settings["env"], settings["physics"]):
+        raise ValueError
     members = []
     for entry in content["members"]:
         if type(entry["seed"]) is not int:

@@ -20,7 +20,7 @@ COLUMNS = ("observation", "action", "episode_steps")
 def read_sizes(collected: Collected) -> list[dict[str, Any]]:
     """A record per task whose sizes are known; `episode_steps` is None where only the sizes are.
 
-    They are read from the environment, or, where it cannot be made by its name, from a run's policy.
+    They are read from the environment, or, where it cannot be made by its name, from a run's config.json or policy.
     """
     found = [dict(_sizes_by_name(name)) for name in PAPERS_TASKS]
     for task in collected.tasks:
@@ -28,7 +28,7 @@ def read_sizes(collected: Collected) -> list[dict[str, Any]]:
             continue
         groups = [group for group in collected.groups if group.env == task]
         record = None if groups[0].own_env else _known(task)
-        record = record or _sizes_by_policies(task, groups)
+        record = record or _sizes_by_runs(task, groups)
         found += [dict(record)] if record else []
     return found
 
@@ -51,7 +51,7 @@ def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> ResultTable:
     header += [f"{published.PAPER}: observation / action"] if reference else []
     caption = "Read from the environments."
     if any(row["episode_steps"] is None for row in sizes):
-        caption += " Without the steps of an episode: read from a run's policy."
+        caption += " Without the steps of an episode: read from the runs."
     return ResultTable("table1", "Table 1: sizes of the tasks", header, [lines], caption, [], records)
 
 
@@ -71,11 +71,11 @@ def _sizes_by_name(name: str) -> Mapping[str, Any]:
     return {"env": name, "task": task} | sizes
 
 
-def _sizes_by_policies(task: str, groups: Sequence[Group]) -> Mapping[str, Any] | None:
-    """The sizes in the first policy/config.json of the task's runs that has them; None without one."""
+def _sizes_by_runs(task: str, groups: Sequence[Group]) -> Mapping[str, Any] | None:
+    """The sizes in the first config.json or policy/config.json of the task's runs that has them; None without one."""
     kind = "own environment" if groups[0].own_env else "unknown here"
-    for run in dict.fromkeys(member.run for group in groups for member in group.members):
-        sizes = _sizes_of_policy(run)
+    for run, own_sizes in dict.fromkeys((member.run, member.own_sizes) for g in groups for member in g.members):
+        sizes = own_sizes or _sizes_of_policy(run)
         if sizes:
             observation, action = sizes
             return {"env": task, "task": kind, "observation": observation, "action": action, "episode_steps": None}

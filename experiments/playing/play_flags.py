@@ -68,13 +68,18 @@ def check(run: Path, options: argparse.Namespace) -> None:
     """
     if not run.is_dir():
         raise UsageError(f"{run}: there is no such folder")
+    if _setting(run, "physics") == "own":  # `sqt_jax.algorithms.OWN_PHYSICS`, without importing JAX
+        raise UsageError(
+            f"{run}: expects a run on one of the library's environments; this one's was handed in from Python: there, "
+            f"use sqt_jax.load_policy({str(run / 'policy')!r}) and sqt_jax.evaluate_policy(policy, env)"
+        )
     if options.video is None:
         for flag, given in {"--size": options.size, "--overwrite": options.overwrite}.items():
             if given:
                 raise UsageError(f"{flag}: has no effect without --video")
         return
     arguments.reject_file("--video", options.video, options.overwrite)
-    if is_brax(name := _env_name(run)):
+    if is_brax(name := _setting(run, "env")):
         if format_of(options.video) != "html":
             raise UsageError(f"--video={options.video}: expects a file with the ending .html, as {name} is Brax's")
         if options.size:
@@ -87,7 +92,7 @@ def choose_graphics(run: Path, options: argparse.Namespace) -> None:
     Raises:
       UsageError: no OpenGL implementation works.
     """
-    if options.video is None or is_brax(_env_name(run)):
+    if options.video is None or is_brax(_setting(run, "env")):
         return
     try:
         os.environ["MUJOCO_GL"] = graphics.choose()
@@ -100,9 +105,9 @@ def is_brax(name: str) -> bool:
     return name.startswith(BRAX)
 
 
-def _env_name(run: Path) -> str:
-    """The environment in a run's config.json; empty if that cannot be read, which `policies.read` reports."""
+def _setting(run: Path, name: str) -> str:
+    """A setting in a run's config.json; empty if that cannot be read, which `policies.read` reports."""
     try:
-        return str(files.read_json(run / "config.json", MAX_CONFIG_BYTES)["settings"]["env"])
+        return str(files.read_json(run / "config.json", MAX_CONFIG_BYTES)["settings"][name])
     except (OSError, ValueError, TypeError, KeyError):
         return ""

@@ -112,11 +112,13 @@ def _check_env(options: flags.Options, env: Environment | None) -> None:
             raise UsageError(f"--{flag}={OWN_PHYSICS}: expects an environment handed in: run.main(argv, env=...)")
     if env is None:
         return
+    if not isinstance(env, Environment):
+        raise UsageError(f"env: expects an Environment (sqt_jax.make_environment), not a {type(env).__name__}")
     if options.env not in (None, env.name):
         raise UsageError(
             f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
         )
-    if not _folder_name(env.name).strip("."):
+    if not isinstance(env.name, str) or not env.name.isprintable() or not _folder_name(env.name).strip("."):
         raise UsageError(f"env: expects an environment with a name that can name a folder, not {env.name!r}")
 
 

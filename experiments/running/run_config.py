@@ -124,9 +124,9 @@ def read(path: Path) -> RunConfig:
         for key, kind in kinds.items():
             if not isinstance(content[key], kind):
                 raise InvalidRunConfig(f"its {NAME} does not describe a run")
-        if not isinstance(content.get("own_env", {}), dict):
-            raise InvalidRunConfig(f"its {NAME} does not describe a run")
         config, rows = members[0].config, content["replay_rows"]
+        if not is_valid_own_env(content.get("own_env", {}), config.env, config.physics):
+            raise InvalidRunConfig(f"its {NAME} does not describe a run")
         train = config.train
         if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
             raise InvalidRunConfig(f"its {NAME} has an invalid replay capacity (replay_rows)")
@@ -142,6 +142,15 @@ def read(path: Path) -> RunConfig:
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise InvalidRunConfig(f"its {NAME} does not describe a run ({type(error).__name__})") from None
     return RunConfig(members, swept, content)
+
+
+def is_valid_own_env(own_env: Any, env: str, physics: str) -> bool:
+    """Whether `own_env` of config.json has sizes and belongs to a printable name; {} where it is missing."""
+    if own_env == {}:
+        return physics != OWN_PHYSICS or env.isprintable()
+    if not isinstance(own_env, dict) or physics != OWN_PHYSICS or not env.isprintable():
+        return False
+    return all(type(own_env.get(name)) is int and own_env[name] > 0 for name in ("observation_size", "action_size"))
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:

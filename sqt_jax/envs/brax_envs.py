@@ -8,6 +8,7 @@ the first start and loses the last observation of an episode
 import contextlib
 import io
 import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -76,8 +77,10 @@ def brax_own(name: str, physics: str) -> Any:
     """Brax's own object for the environment `name` (with its prefix): a `brax.envs.Env`."""
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Brax warns that its physics are no longer developed
-        from brax import envs
+        from brax import envs, fluid
 
+        # Brax 0.14's fluid forces (the swimmer's) call `clip(x, a_min=...)`, which JAX 0.10 no longer accepts.
+        fluid.jp = SimpleNamespace(**vars(jnp) | {"clip": lambda x, a_min: jnp.maximum(x, a_min)})
         return envs.get_environment(name.removeprefix(PREFIX), backend=physics)
 
 

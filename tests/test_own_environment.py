@@ -1,0 +1,90 @@
+"""An environment of your own from start to end, as a user has it: train, resume, tables, figures, report, policy."""
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import sqt_jax
+from experiments import play, plots, report, run, tables
+
+ARGV = ["run", "--algo=td3_sqt", "--seeds=0,1", "--steps=40", "--warmup_steps=20", "--eval_every=20", "--quiet"]
+ARGV += ["--hidden=16,16", "--batch_size=16", "--eval_episodes=1", "--checkpoint_every=20", "--notensorboard"]
+
+
+def make_point(name="point", size=1):
+    def start(key):
+        position = jax.random.uniform(key, (size,), minval=-1.0, maxval=1.0)
+        return position, position
+
+    def advance(position, action):
+        position = position + 0.1 * action
+        return position, position, -jnp.abs(position).sum(), jnp.abs(position).max() > 2
+
+    return sqt_jax.make_environment(name, size, size, 10, start, advance)
+
+
+def copy_run(name, **changes):
+    """The run `first` again, in the folder `name`, with other words in its config.json."""
+    path = Path("runs", name, "td3_sqt", "copy")
+    shutil.copytree("runs/point/td3_sqt/first", path)
+    config = json.loads((path / "config.json").read_text())
+    config["settings"]["env"], config["own_env"] = name, config["own_env"] | changes
+    (path / "config.json").write_text(json.dumps(config))
+
+
+def test_an_environment_of_ones_own_from_start_to_end(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    env, path = make_point(), "runs/point/td3_sqt/first"
+    assert run.main([*ARGV, "--name=first"], env=env) == 0
+    copy_run("point2")
+    copy_run("point", observation_size=2, action_size=2)
+
+    # The same command finds its run; the shell and an environment of other sizes are rejected.
+    assert run.main([*ARGV, "--resume"], env=env) == 0
+    assert capsys.readouterr() == ("", "")
+    assert run.main(["run", f"--resume={path}", "--steps=60"]) == 2
+    expected = f"--resume={path}: expects the environment 'point' handed in: run.main(argv, env=...)\n"
+    assert capsys.readouterr() == ("", expected)
+    assert run.main(["run", f"--resume={path}", "--steps=60"], env=make_point(size=3)) == 2
+    assert "observation_size (its own: 1, now: 3), action_size (its own: 1, now: 3)" in capsys.readouterr().err
+    assert run.main(["run", f"--resume={path}", "--steps=60", "--quiet"], env=env) == 0
+
+    assert tables.main(["tables", "runs", "--out=tables"]) == 0
+    shown = capsys.readouterr().out
+    for task, size in {"point (obs 1, action 1)": 1, "point (obs 2, action 2)": 2, "point2": 1}.items():
+        assert f"| {task} | own environment | {size} | {size} | - |" in (tmp_path / "tables/table1.md").read_text()
+        assert task in shown
+    assert plots.main(["plots", "runs", "--out=figures"]) == 0
+    assert report.main(["report", "runs", "--out=report.html"]) == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "td3_sqt on point (obs 2, action 2), done" in page and "td3_sqt on point2, done" in page
+    assert f"experiments.run.main(['run', '--resume={path}', '--steps=60', '--quiet'], env=env)" in page
+
+    capsys.readouterr()
+    assert play.main(["play", path]) == 2
+    assert f"sqt_jax.load_policy('{path}/policy') and sqt_jax.evaluate_policy(policy, env)" in capsys.readouterr().err
+    policy = sqt_jax.load_policy(f"{path}/policy", member=1)
+    returns, lengths = sqt_jax.evaluate_policy(policy, env, num_episodes=3)
+    assert returns.shape == (3,) and (lengths <= 10).all()
+    with pytest.raises(ValueError, match=r"obs: expected \[B, 1\], got \[3, 2\]"):
+        sqt_jax.evaluate_policy(policy, make_point(size=2), num_episodes=3)
+
+
+def test_a_command_line_without_the_programs_name_is_rejected(capsys):
+    assert run.main(ARGV[1:], env=make_point()) == 2
+    assert capsys.readouterr() == ("", "argv: expects the program's name first, not '--algo=td3_sqt'\n")
+
+
+def test_training_functions_need_the_environment_of_their_configuration():
+    env = make_point()
+    config = sqt_jax.make_config("td3_sqt", env)
+    for make in (sqt_jax.make_train, sqt_jax.make_trainer):
+        with pytest.raises(ValueError, match="an environment of your own called point, given: none"):
+            make(config)
+        with pytest.raises(ValueError, match="an environment of your own called point, given: maze"):
+            make(config, make_point("maze"))
+        assert make(config, env)
