@@ -77,10 +77,9 @@ class Announcer:
         if curves:
             self._line(f"curves: {self.plan.path / 'curves.png'}")
         if outcome.interrupted and self.plan.output["checkpoint_every"]:
-            flag = f"--resume={self.plan.path}"
-            command = f"python -m experiments.run {shlex.quote(flag)}"
+            command = f"python -m experiments.run --resume={shlex.quote(str(self.plan.path))}"
             if self.plan.own_env:
-                command = f"experiments.run.main(['run', {flag!r}], env=env)"
+                command = f"experiments.run.main(['run', {f'--resume={self.plan.path}'!r}], env=env)"
             self._line(f"resume with: {command}")
 
     def _line(self, text: str) -> None:
@@ -94,7 +93,7 @@ def what_to_expect(env: str, steps: int) -> str:
         return ""
     still = task.alive * EPISODE_LENGTH
     return (
-        f"what to expect: {env} earns {task.alive:g} per step for staying upright: up to {still:,.0f} for standing still. "
+        f"what to expect: {env} earns {task.alive:g} per step for staying upright, up to {still:,.0f} for standing still. "
         "A robot that starts to move falls at first: length and return drop before they rise. "
         f"{steps:,} steps are too few to learn to walk; the speed shows whether it moves"
     )
