@@ -36,8 +36,10 @@ def test_share_of_evaluation_of_the_full_protocol():
 
 
 def test_a_short_run_says_what_its_returns_mean():
-    assert "ant earns 1 per step" in what_to_expect("ant", 6_000) and "up to 1,000" in what_to_expect("ant", 6_000)
-    assert "up to 5,000" in what_to_expect("humanoid", 6_000)
+    assert "ant earns 1 per step" in what_to_expect("ant", 6_000) and "1,000 for standing" in what_to_expect(
+        "ant", 6_000
+    )
+    assert "5,000 for standing" in what_to_expect("humanoid", 6_000)
     assert not what_to_expect("cheetah", 6_000)  # it cannot fall
     assert not what_to_expect("ant", SHORT) and not what_to_expect("brax:ant", 6_000)
 
