@@ -1,4 +1,4 @@
-"""The members of a sweep along devices.
+"""Spreads the members of a sweep over devices.
 
 Members never exchange anything. Each device runs the same compiled program on its share of them (`jax.shard_map` over a
 mesh of one axis), with its own loops and branches. Shares are equal: a sweep whose size is not a multiple of the number
@@ -28,7 +28,7 @@ def _is_axis(axis: Any) -> bool:
 
 
 class Layout(NamedTuple):
-    """S members along some devices.
+    """S members, and the devices that they are spread over.
 
     The devices may belong to several hosts (`jax.distributed`): then every process calls the sweep's functions with
     the same arguments and sees the members on its own devices.
@@ -74,7 +74,7 @@ class Layout(NamedTuple):
 
 
 def usable_devices(members: int) -> int:
-    """How many devices of this process a sweep uses by default: the fewest that give each the smallest share."""
+    """The number of devices that a sweep uses by default: the fewest of this process that make shares smallest."""
     here = len(jax.local_devices())
     return math.ceil(members / math.ceil(members / here))
 

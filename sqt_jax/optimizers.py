@@ -1,6 +1,6 @@
-"""How parameters move: Adam with a traced learning rate, and the soft update of target networks.
+"""Parameter updates: Adam with a traced learning rate, and the soft update of target networks.
 
-Neither moves once the agent has diverged. The choice is made number by number inside the step and costs no copy.
+Both return the old values once the agent has diverged. The selection is fused with the step and costs no copy.
 """
 
 import jax

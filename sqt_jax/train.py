@@ -44,6 +44,8 @@ class Means(NamedTuple):
 
 
 class TrainState(NamedTuple):
+    """All that changes while one member trains."""
+
     agent: State
     timestep: TimeStep  # [E, ...]
     episodes: rollout.Episodes
@@ -88,7 +90,8 @@ def make_trainer(
 ) -> Trainer:
     """Joins an agent, an environment and a replay buffer into the training of one member.
 
-    Evaluation plays `eval_env`, by default `env`: the same task on other physics.
+    Args:
+      eval_env: the environment of evaluation, usually the same task on other physics; None: `env`.
     """
     num_envs = config.num_envs
     updates = num_envs * config.updates_per_step  # per lockstep step, so that UTD is per transition

@@ -1,4 +1,4 @@
-"""The few shapes of data that pass between modules.
+"""The data that pass between modules, and the interfaces of agents, environments and replays.
 
 Letters in shapes: `S` members of a sweep, `E` environments per member, `N` critics, `B` batch, `O` observation,
 `A` action; axis order `[S, N, B, ...]`. An interchangeable part (agent, replay, environment) is a NamedTuple of pure
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 Array = jax.Array
 Params = Any  # a pytree of arrays
-State = Any  # a pytree of arrays that only its owner looks into
+State = Any  # a pytree of arrays that only its owner reads
 Metrics = dict[str, Array]  # scalars by name
 
 
@@ -63,7 +63,7 @@ class Environment(NamedTuple):
     status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts to report, summed over environments
     # A lower bound on the mean episode length. 1 is always safe; a larger one saves memory in the replay (`Ring`).
     min_mean_episode_length: int = 1
-    # Forward speed in m/s of the step that led to this time step; None: the environment has no such notion.
+    # Forward speed in m/s of the step that led to this time step; None: the environment does not measure it.
     speed: Callable[[TimeStep], Array] | None = None
 
 
@@ -116,7 +116,7 @@ class Update(Protocol):
 
 class Observe(Protocol):
     def __call__(self, state: State, episode_return: Array, ended: Array, step: Array) -> State:
-        """What an agent learns from the progress of its episodes; called after each environment step.
+        """Reports the progress of the agent's episodes; called after each environment step.
 
         Only TD7 uses it, for its policy checkpoints. Without it TD7 acts with its initial policy for ever.
 
@@ -130,13 +130,13 @@ class Observe(Protocol):
 class Views(NamedTuple):
     """Read-only functions of an agent's state: for evaluation, for records, for saving a policy."""
 
-    policy: Callable[[State], Params]  # state -> what the deterministic policy needs of it
+    policy: Callable[[State], Params]  # state -> the parameters that the deterministic policy needs
     policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
     q_values: Callable[[State, Array, Array], Array]  # (state, obs [B, O], action [B, A]) -> the critics' [N, B]
     # The stochastic policy whose values the critics estimate, if it is not the deterministic one:
     # (state, obs [B, O], key) -> action [B, A], entropy bonus [B].
     sample: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
-    status: Callable[[State], Metrics] = lambda state: {}  # what is reported of the state itself
+    status: Callable[[State], Metrics] = lambda state: {}  # metrics of the state itself
 
 
 class Agent(NamedTuple):
@@ -188,7 +188,7 @@ class Replay(NamedTuple):
     feedback: Callable[[State, Array, Array, Array], State]
     size: Callable[[State], Array]  # state -> [] int32: how many of the newest transitions are complete
     rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows for a checkpoint [count, floats]
-    with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state that has them again
+    with_rows: Callable[[State, Array, Array | int], State]  # (state, saved rows, first) -> state with them
     without_rows: Callable[[State], State]  # state -> the same with None in place of the arrays that `rows` covers
     # A prefix tree of the state for `vmap`: 0, or None for what the members of a sweep share (they insert in lockstep).
     member_axes: Any = 0

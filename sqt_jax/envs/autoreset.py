@@ -39,7 +39,7 @@ Advance = Callable[[State, Array], tuple[State, Array, Array, Array]]
 Place = Callable[[Array, Array], tuple[State, Array]]
 
 
-class Episode(NamedTuple):
+class EpisodeState(NamedTuple):
     """The state of an environment inside a `TimeStep`."""
 
     task: State  # the state of `start` and `advance` (for the Gymnasium tasks: a `PhysicsState`)
@@ -100,10 +100,16 @@ def make_environment(
     """
 
     def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
-        no = jnp.zeros((), bool)
+        false = jnp.zeros((), bool)
         obs = jnp.asarray(obs, jnp.float32)
-        episode = Episode(task, jnp.zeros((), jnp.int32), key, unstable)
-        return TimeStep(episode, obs, jnp.zeros((), jnp.float32), no, no, obs)
+        return TimeStep(
+            state=EpisodeState(task=task, steps=jnp.zeros((), jnp.int32), key=key, unstable=unstable),
+            obs=obs,
+            reward=jnp.zeros((), jnp.float32),
+            terminated=false,
+            truncated=false,
+            final_obs=obs,
+        )
 
     no_steps = np.zeros((), np.int32)
 
@@ -114,13 +120,13 @@ def make_environment(
     def reset(key: Array) -> TimeStep:
         return new_episode(key, jnp.asarray(no_steps))
 
-    def restart(old: tuple[Episode, Array], _: Any) -> tuple[State, Array]:
+    def restart(old: tuple[EpisodeState, Array], _: Any) -> tuple[State, Array]:
         episode, _ = old
         first = new_episode(episode.key, episode.unstable)
         return first.state, first.obs
 
     def step(timestep: TimeStep, action: Array) -> TimeStep:
-        episode: Episode = timestep.state
+        episode: EpisodeState = timestep.state
         task, obs, reward, terminated = advance(episode.task, jnp.clip(action, -1, 1))
         obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(reward, jnp.float32)
         finite = (jnp.abs(reward) < LARGEST) & jnp.all(jnp.abs(obs) < LARGEST)  # false for NaN too
@@ -132,8 +138,16 @@ def make_environment(
         truncated = steps >= episode_length
 
         ended = terminated | truncated
-        state, obs = cond_if_any(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
-        return TimeStep(state, obs, reward, terminated, truncated, final_obs)
+        state = EpisodeState(task=task, steps=steps, key=episode.key, unstable=unstable)
+        state, obs = cond_if_any(ended, restart, (state, final_obs))
+        return TimeStep(
+            state=state,
+            obs=obs,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            final_obs=final_obs,
+        )
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:
         assert place is not None

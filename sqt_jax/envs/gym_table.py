@@ -43,7 +43,7 @@ class Task(NamedTuple):
 
 
 def _solver(iterations: int, ls_iterations: int = 3) -> Mapping[str, Mapping[str, int]]:
-    """Options of MJX's solver: the fewest steps that lose no accuracy against MuJoCo (measured: BUILD_NOTES.md)."""
+    """Options of MJX's solver: the fewest steps without a loss of accuracy (experiments/results/physics.md)."""
     return {"mjx": {"iterations": iterations, "ls_iterations": ls_iterations}}
 
 
