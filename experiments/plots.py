@@ -40,7 +40,7 @@ def parser() -> Parser:
 
 
 def command(argv: Sequence[str]) -> None:
-    """Raises `UsageError`."""
+    """Writes the figures. Raises `UsageError`."""
     options = parser().read(argv)
     from experiments.evidence import figures, pooling  # imports JAX and matplotlib
 
@@ -56,7 +56,7 @@ def command(argv: Sequence[str]) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line `argv`, program name first; returns the exit code."""
+    """Runs the command line `argv`, program name first; returns the exit code."""
     return guarded(command, argv)
 
 

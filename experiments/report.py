@@ -36,7 +36,7 @@ def parser() -> Parser:
 
 
 def command(argv: Sequence[str]) -> None:
-    """Raises `UsageError`."""
+    """Writes the report. Raises `UsageError`."""
     options = parser().read(argv)
     arguments.reject_file("--out", options.out, options.overwrite)
     from experiments.evidence import page, pooling  # imports JAX and matplotlib
@@ -51,7 +51,7 @@ def command(argv: Sequence[str]) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line `argv`, program name first; returns the exit code."""
+    """Runs the command line `argv`, program name first; returns the exit code."""
     return guarded(command, argv)
 
 

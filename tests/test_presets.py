@@ -3,7 +3,7 @@ import jax
 import pytest
 from probe_envs import constant_reward
 
-from experiments.commandline.presets import PRESETS, Row, preset_settings
+from experiments.commandline.presets import PRESETS, PresetRow, preset_settings
 from sqt_jax.algorithms import ALGORITHMS, make_config, make_train
 from sqt_jax.config import ConfigError
 
@@ -49,7 +49,7 @@ def test_paper_changes_nothing_and_quick_is_shorter():
 
 
 def test_later_rows_win_where_their_patterns_match(monkeypatch):
-    rows = (Row({"steps": 1, "lr": 0.1}), Row({"steps": 2}, algo="td3*"), Row({"lr": 0.3}, env="ant"))
+    rows = (PresetRow({"steps": 1, "lr": 0.1}), PresetRow({"steps": 2}, algo="td3*"), PresetRow({"lr": 0.3}, env="ant"))
     monkeypatch.setitem(PRESETS, "layers", rows)
     assert preset_settings("layers", "sac", "walker") == {"steps": 1, "lr": 0.1}
     assert preset_settings("layers", "td3_sqt", "walker") == {"steps": 2, "lr": 0.1}

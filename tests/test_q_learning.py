@@ -71,7 +71,7 @@ def learner_of(num_tables):
     return ta.Learner(tables, jnp.ones_like(tables), jnp.int32(0), jnp.int32(0))
 
 
-SEEN = ta.Transition(jnp.int32(0), jnp.int32(1), jnp.float32(1.0), jnp.int32(1), jnp.float32(1.0))
+SEEN = ta.TabularTransition(jnp.int32(0), jnp.int32(1), jnp.float32(1.0), jnp.int32(1), jnp.float32(1.0))
 
 
 def test_only_the_table_that_learns_changes_by_its_own_step_size():

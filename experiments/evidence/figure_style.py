@@ -47,7 +47,7 @@ MAX_LINES = 6
 
 
 class Style(NamedTuple):
-    """How a row's lines look."""
+    """Colour, line and marker of a row."""
 
     colour: str
     line: Any  # one of matplotlib's line styles

@@ -1,4 +1,4 @@
-"""The command line of `experiments.play`, and every check of it that needs neither JAX nor MuJoCo."""
+"""The command line of `experiments.play`, and the checks that need neither JAX nor MuJoCo."""
 
 import argparse
 import os
@@ -18,7 +18,7 @@ evaluation is played, unless --seed or --member names another. Without a display
 implementation; by default EGL or OSMesa, whichever works."""
 MAX_SEED = 2**32 - 1
 MAX_CONFIG_BYTES = 10_000_000
-BRAX = "brax:"
+BRAX = "brax:"  # `brax_envs.PREFIX`, whose module imports JAX
 
 
 def parser() -> Parser:

@@ -55,6 +55,8 @@ class Rows(NamedTuple):
 
 
 class Manifest(NamedTuple):
+    """The content of a checkpoint's manifest.json."""
+
     state: dict[str, tuple[int, int]]  # size and CRC of each file below state/
     rows: list[Rows]
     position: Position
@@ -78,6 +80,7 @@ def rows_needed(rows: list[Rows], env_steps: int, capacity: int) -> list[Rows]:
 
 
 def write(path: Path, manifest: Manifest) -> None:
+    """Writes a manifest, completely or not at all. Raises `OSError`."""
     content: dict[str, Any] = {"format": FORMAT, "state": manifest.state, "rows": [file.name for file in manifest.rows]}
     content |= {"crc": [file.crc for file in manifest.rows], "position": manifest.position._asdict()}
     content |= {"lengths": manifest.lengths}

@@ -47,7 +47,7 @@ class Plan(NamedTuple):
 
 
 class _Target(NamedTuple):
-    """Which run a command line means."""
+    """The run that a command line refers to."""
 
     members: list[Member]
     swept: list[str]
@@ -104,7 +104,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
 
 
 def _check_env(options: flags.Options, env: Environment | None) -> None:
-    """Flags that contradict an environment handed in, or that need one."""
+    """Rejects flags that contradict an environment handed in, or that need one."""
     for flag in ("physics", "eval_physics"):
         if env is not None and flag in options.settings:
             raise UsageError(f"--{flag}: has no effect with an environment handed in")
@@ -240,12 +240,14 @@ def _is_valid_output(name: str, value: Any) -> bool:
 
 
 def not_only_a_run(path: Path) -> UsageError:
+    """The error for --overwrite of a folder that holds other files too."""
     return UsageError(
         f"--overwrite: {path} holds other things than a run; expects a folder that holds a run and nothing else"
     )
 
 
 def name_taken(path: Path) -> UsageError:
+    """The error for a name that another run has."""
     return UsageError(
         f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
     )

@@ -45,7 +45,7 @@ def define_flags() -> absl_flags.FlagValues:
     return values
 
 
-def parse(argv: Sequence[str]) -> tuple[study.Settings, Path]:
+def parse(argv: Sequence[str]) -> tuple[study.StudySettings, Path]:
     """The settings and the folder of the results, from the command line `argv`, program name first.
 
     Raises:
@@ -93,10 +93,10 @@ def parse(argv: Sequence[str]) -> tuple[study.Settings, Path]:
         raise UsageError("--weighted_c: expects a number above 0, got 0")
     out = flag.pop("out")
     _check_out(out, flag.pop("overwrite"))
-    settings = {name: flag[name] for name in (field.name for field in dataclasses.fields(study.Settings))}
+    settings = {name: flag[name] for name in (field.name for field in dataclasses.fields(study.StudySettings))}
     for name in ("mdps", "algos", "coefs"):
         settings[name] = tuple(settings[name])
-    return study.Settings(**settings), Path(out)
+    return study.StudySettings(**settings), Path(out)
 
 
 def _check_list(name: str, words: Sequence) -> None:
