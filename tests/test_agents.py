@@ -151,7 +151,7 @@ def learned(state):
 
 
 @every_variant
-def test_a_variant_starts_exactly_as_its_base(algo):
+def test_a_variant_starts_exactly_as_its_baseline(algo):
     scalars = subject(algo).config.scalars()
     ours, plain = (jax.make_jaxpr(subject(name).agent.init)(KEY, scalars) for name in (algo, base_of(algo)))
     assert str(ours) == str(plain)
@@ -199,7 +199,7 @@ def test_dtypes_do_not_promote_by_accident(algo):
 
 
 @every_algorithm
-def test_update_is_the_parts_update_with_its_own_draws(algo):
+def test_update_of_the_agent_is_that_of_the_parts_with_its_own_draws(algo):
     """The same program, so that nothing needs to be compiled."""
     _, parts, agent, *_ = subject(algo)
     arguments = jax.eval_shape(agent.init, KEY), make_batch(0), KEY, jnp.int32(0)
@@ -278,7 +278,7 @@ def test_td3_smooths_the_target_action_within_its_clip():
 
 
 @every_variant
-def test_coefficient_zero_is_the_plain_algorithm_bit_for_bit(algo):
+def test_coefficient_zero_is_the_baseline_bit_for_bit(algo):
     """The target is so by arithmetic (test_q_targets); the rest because XLA compiles it alike in both programs."""
     plain, _ = run(base_of(algo), start(base_of(algo)), enough(algo))
     ours, _ = run(algo, start(algo, scalars=subject(algo).config.scalars()._replace(penalty_coef=0.0)), enough(algo))
@@ -297,7 +297,7 @@ def test_a_positive_coefficient_changes_target_and_training(algo):
 
 
 @every_variant
-def test_the_target_is_the_plain_target_less_the_penalty(algo):
+def test_the_target_is_the_baselines_target_minus_the_penalty(algo):
     inside, outside = subject(algo).parts, subject(algo, penalty_inside_gamma=False).parts
     plain, state, batch = subject(base_of(algo)).parts, start(algo), make_batch(0)
 
@@ -402,7 +402,7 @@ def test_each_networks_first_step_has_the_learning_rates_length(algo):
 
 
 @algorithm_rows.every(KINDS, fast=ONE_OF_EACH)
-def test_members_side_by_side_are_each_member_alone(algo):
+def test_members_in_a_sweep_train_as_each_member_alone_does(algo):
     agent, update = subject(algo).agent, subject(algo).update
     default = subject(algo).config.scalars()
     coefs = (0.0, 0.5, 1.0) if algo in VARIANTS else (0.0, 0.0, 0.0)
@@ -531,7 +531,7 @@ FAULTS = {
 
 @every_kind
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_diverged_agent_stays_as_it_was_for_good(algo, fault):
+def test_a_diverged_agent_never_changes_again(algo, fault):
     def parts(state, *without):
         return with_learner(state, **dict.fromkeys(("diverged", *without)))
 

@@ -90,7 +90,7 @@ def test_actions_are_clipped():
     assert play([[-7.0, 0.0, 0.0]])[-1].obs[2] == -1
 
 
-def test_a_reset_is_not_an_end():
+def test_a_reset_does_not_end_an_episode():
     timestep = play([])[0]
     assert not timestep.terminated
     assert not timestep.truncated

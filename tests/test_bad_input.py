@@ -129,7 +129,7 @@ def short(value):
 
 
 @pytest.mark.parametrize(("argument", "begins", "expects"), FLAGS, ids=[short(row[0]) for row in FLAGS])
-def test_a_bad_flag_is_rejected(folder, capsys, argument, begins, expects):
+def test_an_invalid_flag_is_rejected(folder, capsys, argument, begins, expects):
     rejected(folder, capsys, [*NEW.split(), argument], begins, expects)
 
 
@@ -159,7 +159,7 @@ TOGETHER = [
 
 
 @pytest.mark.parametrize(("arguments", "begins", "expects"), TOGETHER, ids=[row[0] for row in TOGETHER])
-def test_flags_that_cannot_be_together_are_rejected(folder, capsys, arguments, begins, expects):
+def test_flags_that_exclude_each_other_are_rejected(folder, capsys, arguments, begins, expects):
     rejected(folder, capsys, [*NEW.split(), *arguments.split()], begins, expects)
 
 
@@ -197,7 +197,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_a_bad_file_of_flags_is_rejected(folder, capsys, case):
+def test_an_invalid_file_of_flags_is_rejected(folder, capsys, case):
     content, expects = FILES[case]
     (folder / "flags.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
     given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would win
@@ -205,7 +205,7 @@ def test_a_bad_file_of_flags_is_rejected(folder, capsys, case):
 
 
 @pytest.mark.parametrize("path", ["none.yaml", "empty", "/dev/zero", "x" * 300, "fifo", "lön\x07k"])
-def test_what_is_no_file_is_rejected(folder, capsys, path):
+def test_a_path_that_is_no_file_is_rejected(folder, capsys, path):
     os.mkfifo(folder / "fifo")
     rejected(
         folder, capsys, [*NEW.split(), f"--config={path}"], "--config=", "expects a file|no such file|cannot be read"
@@ -271,7 +271,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("case", CHANGED)
-def test_a_run_whose_settings_cannot_be_is_rejected(folder, capsys, case):
+def test_a_run_with_invalid_settings_is_rejected(folder, capsys, case):
     change, expects = CHANGED[case]
     config = json.loads((RUN / "config.json").read_text())
     change(config)
@@ -372,7 +372,7 @@ RESUMED = [
 
 
 @pytest.mark.parametrize(("arguments", "begins", "expects"), RESUMED, ids=[short(row[0]) for row in RESUMED])
-def test_a_resume_that_cannot_be_is_rejected(folder, capsys, arguments, begins, expects):
+def test_an_invalid_resume_is_rejected(folder, capsys, arguments, begins, expects):
     text = arguments.replace("RUN", str(RUN)).replace("NEW", NEW)
     rejected(folder, capsys, text.split(" "), begins.replace("RUN", str(RUN)), expects.replace("RUN", str(RUN)))
 
@@ -409,13 +409,13 @@ NOT_RUNS = [foreign_file, foreign_folder, a_link_below, a_link_itself, a_link_to
 
 
 @pytest.mark.parametrize("change", NOT_RUNS, ids=[change.__name__ for change in NOT_RUNS])
-def test_what_is_not_a_run_alone_is_not_replaced(folder, capsys, change):
+def test_a_folder_with_other_files_than_a_run_is_not_replaced(folder, capsys, change):
     change(RUN)
     expects = "expects a folder that holds a run and nothing else"
     rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", expects)
 
 
-def test_a_file_in_a_runs_place_is_not_replaced(folder, capsys):
+def test_a_file_at_the_path_of_a_run_is_not_replaced(folder, capsys):
     shutil.rmtree(RUN)
     RUN.write_text("mine")
     rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--out=runs:", "expects a folder")
@@ -430,7 +430,7 @@ with files.locked(pathlib.Path(sys.argv[1])):
 """
 
 
-def test_a_run_at_which_another_process_is_at_work_is_rejected(folder, capsys):
+def test_a_run_that_another_process_is_training_is_rejected(folder, capsys):
     command = [sys.executable, "-c", HOLD, str(RUN.absolute())]
     pipe = subprocess.PIPE
     root = Path(__file__).resolve().parent.parent

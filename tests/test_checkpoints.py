@@ -86,7 +86,7 @@ def listing(store):
 
 
 @algorithm_rows.every(fast=("td7_sqt_tuple",))  # the other tests here take td3_sqt
-def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
+def test_every_algorithm_resumes_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)
     state = case.saved(store, 50, 90)
@@ -105,7 +105,7 @@ def test_a_restored_state_needs_no_new_compilation(case, tmp_path):
     assert case.sweep.advance._cache_size() == compiled
 
 
-def test_training_may_go_on_while_a_checkpoint_is_written(case, tmp_path):
+def test_training_continues_while_a_checkpoint_is_written(case, tmp_path):
     store = case.store(tmp_path)
     state = case.trained(60)
     store.save(state, position(60), LENGTHS)
@@ -114,7 +114,7 @@ def test_training_may_go_on_while_a_checkpoint_is_written(case, tmp_path):
     assert same(store.restore(case.template).state, case.trained(60))
 
 
-def test_rows_are_written_once_and_only_those_that_are_filled(case, tmp_path):
+def test_only_filled_rows_are_written_and_each_once(case, tmp_path):
     store = case.store(tmp_path)
     case.saved(store, 45, 60)
     rows = sorted(store.path.glob("rows_*"))
@@ -124,7 +124,7 @@ def test_rows_are_written_once_and_only_those_that_are_filled(case, tmp_path):
     assert case.store(tmp_path).sizes(case.template)[1] == len(SEEDS) * width * 4
 
 
-def test_rows_go_to_the_disk_in_pieces(case, tmp_path, monkeypatch):
+def test_rows_are_written_in_pieces(case, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "PIECE_BYTES", 10 * len(SEEDS) * 6 * 4)
     store = case.store(tmp_path)
     state = case.saved(store, 60, 100)
@@ -182,7 +182,7 @@ def disk_is_full_for_the_manifest(monkeypatch):
     [disk_is_full_for_rows, disk_is_full_for_the_state, disk_is_full_for_the_manifest],
     ids=lambda f: f.__name__,
 )
-def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
+def test_a_full_disk_does_not_stop_training(case, tmp_path, fault):
     store = case.store(tmp_path)
     state = case.saved(store, 60)
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -204,7 +204,7 @@ def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(80))
 
 
-def test_room_that_comes_back_is_used_by_the_same_process(case, tmp_path):
+def test_freed_disk_space_is_used_by_the_same_process(case, tmp_path):
     store = case.store(tmp_path)
     state = case.saved(store, 60)
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -218,7 +218,7 @@ def test_room_that_comes_back_is_used_by_the_same_process(case, tmp_path):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(80))
 
 
-def test_a_resume_keeps_no_more_than_it_is_told_to(case, tmp_path):
+def test_a_resumed_run_keeps_as_many_checkpoints_as_the_flag_says(case, tmp_path):
     case.saved(case.store(tmp_path, keep=3), 50, 60, 130)
     store = case.store(tmp_path, keep=1)
     store.restore(case.template)
@@ -227,11 +227,11 @@ def test_a_resume_keeps_no_more_than_it_is_told_to(case, tmp_path):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(130))
 
 
-def test_where_nothing_was_saved_nothing_is_restored(case, tmp_path):
+def test_without_a_checkpoint_nothing_is_restored(case, tmp_path):
     assert case.store(tmp_path).restore(case.template) is None
 
 
-def test_what_a_dead_process_left_half_written_is_removed(case, tmp_path):
+def test_incomplete_files_of_a_dead_process_are_removed(case, tmp_path):
     store = case.store(tmp_path)
     state = case.saved(store, 60)
     (store.path / "step_0000000070.part" / "state").mkdir(parents=True)
@@ -256,7 +256,7 @@ def test_the_rows_of_older_checkpoints_outlive_a_resume(case, tmp_path):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(60))
 
 
-def test_a_file_that_cannot_be_read_is_no_reason_to_give_a_checkpoint_up(case, tmp_path, monkeypatch):
+def test_a_checkpoint_is_kept_if_a_file_cannot_be_read_now(case, tmp_path, monkeypatch):
     store = case.store(tmp_path)
     case.saved(store, 50, 60)
     before = listing(store)
@@ -293,7 +293,7 @@ def test_a_step_is_saved_again_after_its_evaluation(case, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_environments_per_member_fill_the_ring_side_by_side(tmp_path):
+def test_several_environments_per_member_fill_the_ring_interleaved(tmp_path):
     case = Case(num_envs=4)
     state = case.saved(case.store(tmp_path), 48, 100)
     restored = case.store(tmp_path).restore(case.template)
@@ -323,7 +323,7 @@ def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
 
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
 @pytest.mark.slow
-def test_members_come_back_on_any_devices_without_the_copies_that_filled_them(case, tmp_path):
+def test_members_are_restored_on_any_devices_without_padding(case, tmp_path):
     two = Case(devices=2)
     state = two.saved(two.store(tmp_path), 50, 90)
     assert state.replay.storage.shape[0] == 4
@@ -338,7 +338,7 @@ def test_members_come_back_on_any_devices_without_the_copies_that_filled_them(ca
     assert same(two.advance(again, 30, True), two.advance(state, 30, True))
 
 
-def test_keys_come_back_as_keys(case, tmp_path):
+def test_keys_are_restored_as_keys(case, tmp_path):
     store = case.store(tmp_path)
     case.saved(store, 50)
     key = store.restore(case.template).state.key
@@ -346,7 +346,7 @@ def test_keys_come_back_as_keys(case, tmp_path):
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(case.trained(40).key))
 
 
-def test_arrays_without_entries_come_back_too(case, tmp_path):
+def test_empty_arrays_are_restored_too(case, tmp_path):
     """Brax's environments carry some."""
 
     def with_one(state):

@@ -42,7 +42,7 @@ def finished(tmp_path_factory):
     return code, out / "ant" / "sac_sqt" / "run"
 
 
-def test_a_run_leaves_its_files(finished):
+def test_the_files_of_a_run(finished):
     code, path = finished
     assert code == 0
     names = {item.name for item in path.iterdir()}
@@ -52,7 +52,7 @@ def test_a_run_leaves_its_files(finished):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "released"])
-def test_td7_tells_of_its_checkpoints(preset, tmp_path):
+def test_td7_reports_its_policy_checkpoints(preset, tmp_path):
     """TD7's state and metrics are unlike the others': a whole run of it."""
     more = ("--algo=td7_sqt", "--embedding_size=8", f"--preset={preset}", "--policy_delay=2")
     assert run(tmp_path, *more) == 0
@@ -104,7 +104,7 @@ def test_metrics_of_a_run(finished):
     assert [row["q_std"] for row in rows] == [row["q_std"] for row in evaluations]
 
 
-def test_settings_of_a_run_make_it_again(finished):
+def test_settings_of_a_run_repeat_it(finished):
     config = json.loads((finished[1] / "config.json").read_text())
     settings = config["settings"]
     assert {"algo": "sac_sqt", "env": "ant", "steps": 120, "hidden": [8, 8]}.items() <= settings.items()
@@ -147,7 +147,7 @@ def test_output_of_a_run(tmp_path, capsys):
     assert not (path / "tensorboard").exists()
 
 
-def test_quiet_says_nothing(tmp_path, capsys):
+def test_quiet_prints_nothing(tmp_path, capsys):
     assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 0
     assert capsys.readouterr() == ("", "")
 
@@ -193,7 +193,7 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_keeps_what_it_has(tmp_path, monkeypatch, number):
+def test_an_interrupted_run_keeps_its_results_so_far(tmp_path, monkeypatch, number):
     def report(self, report, original=records.Records.report):
         original(self, report)
         if report.env_steps == 50:
@@ -210,7 +210,7 @@ def test_an_interrupted_run_keeps_what_it_has(tmp_path, monkeypatch, number):
     assert (path / "curves.png").exists()
 
 
-def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsys):
+def test_only_a_run_is_replaced_and_only_with_overwrite(tmp_path, capsys):
     path = tmp_path / "ant" / "sac_sqt" / "run"
     path.mkdir(parents=True)
     (path / "config.json").write_text("old")
@@ -227,7 +227,7 @@ def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsy
     assert json.loads((path / "config.json").read_text())["settings"]["algo"] == "sac_sqt"
 
 
-def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
+def test_the_default_name_has_the_settings_and_the_time(tmp_path):
     arguments = TINY.removesuffix(" --name=run").split()
     options = ["--penalty_coef=0,0.5", "--quiet", f"--out={tmp_path}"]
     assert main(["experiments.run", *arguments, *options]) == 0
@@ -281,7 +281,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "line"), BAD, ids=[arguments[:40] for arguments, _ in BAD])
-def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, line):
+def test_an_invalid_command_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, line):
     # Spaces separate arguments; a newline belongs to one.
     assert run(tmp_path / "out", *arguments.split(" ")) == 2
     out, err = capsys.readouterr()

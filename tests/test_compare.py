@@ -99,7 +99,7 @@ def test_processes_that_do_not_start_are_a_failure_and_the_others_are_measured(m
 
 
 @pytest.mark.parametrize(("backend", "device"), [("cpu", "cpu"), ("gpu", "cuda")])
-def test_pytorch_computes_where_we_do(monkeypatch, backend, device):
+def test_pytorch_uses_our_device(monkeypatch, backend, device):
     given = []
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(compare, "measure_cases", lambda cases, **timing: [case.prepare() for case in cases[1:]] and [])
@@ -108,7 +108,7 @@ def test_pytorch_computes_where_we_do(monkeypatch, backend, device):
     assert given == [["27", "8", device]]
 
 
-def test_ours_is_compared_with_the_best_of_theirs():
+def test_our_rate_is_compared_with_the_peers_best():
     def row(what, members, rate):
         return Measurement("compare", what, members, "env steps", rate, 0.0)
 

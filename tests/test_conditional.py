@@ -58,7 +58,7 @@ def test_unbatched_arguments_are_shared():
     )
 
 
-def test_the_branch_is_one_in_the_compiled_loop():
+def test_the_compiled_loop_has_a_real_branch():
     """One conditional, and no select of the state outside of it."""
 
     def loop(old, given):

@@ -197,7 +197,7 @@ def test_sizes_and_settings_are_those_of_the_file(name, tmp_path):
     assert max(deviation.values()) < 0.1
 
 
-def test_a_number_that_is_none_agrees_with_nothing(monkeypatch):
+def test_a_nan_agrees_with_nothing(monkeypatch):
     name = "td3_sqt"
     arrays = dict(np.load(DATA / f"{name}.npz"))
     monkeypatch.setattr(lap, "priority", lambda *_: jnp.nan)

@@ -111,7 +111,7 @@ def test_starts_have_gymnasiums_distribution(name):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_actions_are_stretched_to_the_actuators_range(name, recording_physics):
+def test_actions_are_scaled_to_the_actuators_range(name, recording_physics):
     limit = 0.4 if name.startswith("humanoid") else 1.0
     env = envs.make(name, physics="recording")
     action = jnp.linspace(-1, 1, env.action_size)
@@ -124,7 +124,7 @@ def test_actions_are_stretched_to_the_actuators_range(name, recording_physics):
     np.testing.assert_allclose(excess.state.task.internal, limit, rtol=1e-6)
 
 
-def test_a_tasks_options_reach_its_physics_and_give_way_to_the_callers(monkeypatch):
+def test_a_tasks_options_reach_its_physics_and_the_callers_override_them(monkeypatch):
     seen = []
 
     def make_physics(name, setup, **options):

@@ -250,12 +250,12 @@ def test_the_priority_is_the_clipped_error_to_the_power(maybe_jit):
     np.testing.assert_array_equal(lap.priority(error, 0.0, 1.0), np.ones(4))
 
 
-def test_a_signed_error_counts_by_its_size_and_one_that_is_not_finite_as_none():
+def test_the_size_of_an_error_counts_and_one_that_is_not_finite_is_0():
     error = jnp.array([-32.0, jnp.nan, jnp.inf, -jnp.inf])
     np.testing.assert_allclose(lap.priority(error, 0.4, 1.0), [4, 1, 1, 1], rtol=1e-6)
 
 
-def test_feedback_sets_the_priorities_of_its_rows_alone():
+def test_feedback_sets_only_the_priorities_of_its_rows():
     *_, feedback = compiled()
     rows = np.arange(0, 960, 60, dtype=np.int32)
     state = feedback(filled(), rows, jnp.full(BATCH, 32.0), jnp.int32(1))
@@ -284,7 +284,7 @@ def test_new_rows_get_the_largest_priority_seen():
     np.testing.assert_array_equal(priorities[200:], 0)
 
 
-def test_every_few_updates_alone_the_maximum_becomes_the_buffers():
+def test_the_maximum_becomes_the_buffers_only_every_few_updates():
     state, seen = filled(100), []
     for k, error in enumerate([1.0, 32.0, 1.0, 1.0, 1.0, 1.0, 243.0, 1.0], start=1):
         state = give(state, error, k)
@@ -308,7 +308,7 @@ def test_a_row_that_is_overwritten_loses_its_old_priority():
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
+def test_a_row_that_lost_its_final_observation_is_not_drawn_any_more(num_envs):
     """Every episode is one step, and there is room for those of a tenth of the rows."""
     init, insert, *_ = compiled(num_envs, capacity=40, min_mean_episode_length=10)
     state, room = init(), 4 + num_envs
@@ -411,7 +411,7 @@ def test_only_the_rare_refresh_reads_all_priorities(loops):
             assert bool(readers) == (shape == priorities)  # the refresh's maximum
 
 
-def test_nothing_else_grows_with_the_capacity(loops):
+def test_no_other_operation_grows_with_the_capacity(loops):
     """The two programs differ in the shapes of the state only."""
     programs = {}
     for capacity, (state, executable) in loops.items():

@@ -145,12 +145,12 @@ def test_imports_go_downwards(module):
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_parts_that_must_not_know_each_other(module):
+def test_parts_that_must_not_import_each_other(module):
     forbidden = NEVER.get(unit(module), ())
     assert not [other for other in imported(module) for package in forbidden if inside(other, package)]
 
 
-def test_the_library_knows_neither_experiments_nor_tests():
+def test_the_library_imports_neither_experiments_nor_tests():
     for module in modules("sqt_jax"):
         assert not [other for other in imported(module) if not inside(other, "sqt_jax")]
     assert not [other for module in MODULES for other in imported(module) if inside(other, "tests")]
@@ -172,7 +172,7 @@ def test_agents_import_each_other_only_as_stated():
         assert others <= {f"{package}.{other}" for other in allowed}
 
 
-def test_the_reader_of_imports_sees_all_their_forms():
+def test_every_form_of_import_is_found():
     known = frozenset({"sqt_jax.envs", "sqt_jax.train", "sqt_jax.types", "sqt_jax.agents.sac", "experiments.run"})
     source = (
         "import jax\nimport sqt_jax.envs as e\nfrom sqt_jax import train\nfrom sqt_jax.types import Array\n"

@@ -47,7 +47,7 @@ def test_probabilities(name):
     assert reached.all()
 
 
-def test_the_chain_is_best_left_at_once():
+def test_leaving_the_chain_at_once_is_optimal():
     q = mdps.optimal_q(mdps.bias_chain(links=3, actions=4, mean=-0.1), 0.5)
     after = -0.1 * (1 + 0.5 + 0.25)
     np.testing.assert_allclose(q[0], [0, 0, 0.5 * after, 0.5 * after])
@@ -68,7 +68,7 @@ def test_slipping_goes_in_any_direction():
     np.testing.assert_allclose(mdp.reward[7, 3], 0.7 * 1 + 0.3 * -0.1)
 
 
-def test_centred_values_are_0_on_average_where_nothing_ends():
+def test_centred_values_are_0_on_average_if_no_episode_ends():
     mdp = mdps.centred(mdps.random_mdp(5), 0.8)
     assert mdps.optimal_q(mdp, 0.8).mean() == pytest.approx(0, abs=1e-10)
     chain = mdps.bias_chain()

@@ -43,7 +43,7 @@ def test_shares_are_equal(count, devices, held):
         (8, 17, 6),
     ],
 )
-def test_a_sweep_takes_the_devices_that_get_members(monkeypatch, here, count, used):
+def test_a_sweep_uses_the_devices_that_get_members(monkeypatch, here, count, used):
     monkeypatch.setattr(jax, "local_devices", lambda: list(range(here)))
     assert members.usable_devices(count) == used
     assert Layout(count, (jax.devices()[0],) * used).held - count < math.ceil(count / used)
@@ -91,7 +91,7 @@ def test_members_train_on_two_devices_as_on_one(both):
 
 
 @two_devices
-def test_each_device_holds_its_share_alone(both):
+def test_each_device_holds_only_its_share(both):
     _, (_, (_, state)) = both
     for leaf in jax.tree.leaves((state.agent.actor, state.replay)):
         if not leaf.ndim:

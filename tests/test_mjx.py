@@ -109,7 +109,7 @@ def test_solver_options_reach_the_solver(options, expected, monkeypatch):
     assert solver_settings(options, monkeypatch) == expected
 
 
-def test_none_takes_the_files_settings(monkeypatch):
+def test_none_means_the_files_settings(monkeypatch):
     model = gym_tasks.load_model(TASKS["humanoid"])
     options = {"iterations": None, "ls_iterations": None}
     assert solver_settings(options, monkeypatch) == (model.opt.iterations, model.opt.ls_iterations)
@@ -141,7 +141,7 @@ def test_state_is_small(name):
     assert task < timestep.obs.size + 40
 
 
-def test_matrix_products_are_in_full_precision_whatever_the_program_around_asks():
+def test_matrix_products_have_full_precision_in_any_program():
     env = envs.make("cheetah")
     timestep = jax.eval_shape(env.reset, jax.random.key(0))
     with (

@@ -149,7 +149,7 @@ REJECTED = [
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(("arguments", "says"), REJECTED, ids=[ascii(row[0])[1:60] for row in REJECTED])
-def test_bad_usage_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
+def test_an_invalid_command_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
     before = sorted(folder.rglob("*"))
     assert play.main(["play", *(word for word in arguments.split(" ") if word)]) == 2
     out, err = capsys.readouterr()
@@ -167,7 +167,7 @@ def test_without_opengl_a_film_is_rejected_before_anything_is_played(folder, cap
     assert not Path("film.mp4").exists()
 
 
-def test_an_interrupt_is_no_traceback(monkeypatch):
+def test_an_interrupt_prints_no_traceback(monkeypatch):
     def interrupted(argv):
         raise KeyboardInterrupt
 

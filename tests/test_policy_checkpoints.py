@@ -53,7 +53,7 @@ def test_before_the_switch_each_episode_is_an_assessment():
     ]
 
 
-def test_after_the_switch_an_assessment_takes_its_episodes_and_ends_early_below_the_best():
+def test_after_the_switch_an_assessment_has_several_episodes_and_ends_early_below_the_best():
     state = START._replace(snapshot=labelled(50), best_min_return=jnp.float32(6))
     _, rows = story(state, 8.0, 9.0, 7.0, 9.0, 6.5, 7.0, 8.0, 7.5, gradient_steps=SWITCH)
     assert rows == [
@@ -73,7 +73,7 @@ def test_the_switch_is_a_number_of_gradient_steps():
         assert assess(START, 1, gradient_steps, 5.0).assessments == assessments
 
 
-def test_an_assessment_that_the_switch_finds_under_way_goes_on():
+def test_an_assessment_in_progress_continues_over_the_switch():
     state = assess(START, 1, SWITCH, 5.0)
     assert (state.episodes, state.assessments) == (1, 0)
     _, rows = story(state, 6.0, 4.0, gradient_steps=SWITCH + 100, learners=[2, 3])
@@ -87,12 +87,12 @@ def test_a_running_episode_changes_nothing(episode_return):
         assert same(assess(state, 9, gradient_steps, episode_return, ended=False), state)
 
 
-def test_at_the_start_the_policy_is_all_there_is():
+def test_at_the_start_snapshot_and_checkpoint_are_the_policy():
     assert same(policy_checkpoints.start(labelled(0)), START)
 
 
 @pytest.mark.parametrize(("best", "reset"), [(100.0, 90.0), (-100.0, -90.0)])
-def test_the_best_is_lowered_at_the_switch_alone(best, reset):
+def test_the_best_is_lowered_only_at_the_switch(best, reset):
     state = START._replace(best_min_return=jnp.float32(best))
     lowered = [policy_checkpoints.lower_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
     np.testing.assert_allclose([float(state.best_min_return) for state in lowered], [best, reset, best], rtol=1e-6)

@@ -97,7 +97,7 @@ def test_python_examples_run(example, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_loop_of_ones_own_trains_td7_too():
+def test_the_loop_of_the_guide_trains_td7_too():
     (code,) = (code for _, code in PYTHON if "gymnasium.make" in code)
     for shown, td7 in [('"td3_sqt"', '"td7_sqt"'), ("replay.uniform", "lap.lap"), ("import replay", "import lap")]:
         assert code.count(shown) == 1
@@ -127,7 +127,7 @@ def test_commands_that_train_grids_are_valid(argv):
 
 
 @pytest.mark.parametrize("argv", LOOKS, ids=ids)
-def test_commands_that_look_at_runs_are_valid(argv):
+def test_commands_that_read_runs_are_valid(argv):
     assert parsed(argv).runs
 
 

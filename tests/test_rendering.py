@@ -74,7 +74,7 @@ def test_the_default_camera_follows_the_robot():
         assert model.camera(view.fixedcamid).name == "track" and "track" in rendering.cameras(model)
 
 
-def test_a_model_without_that_camera_is_followed_as_well():
+def test_a_robot_without_a_tracking_camera_is_followed_too():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>")
     view = rendering.view_of(model)
     assert (view.type, view.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)

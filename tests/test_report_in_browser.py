@@ -56,7 +56,7 @@ def page(opened, report):
     assert [*opened.requests.values()] == [report.as_uri()]
 
 
-def test_every_figure_is_to_be_seen(page):
+def test_every_figure_is_visible(page):
     boxes = page.run(
         """[...document.querySelectorAll("figure")].map((figure) => {
           const svg = figure.querySelector("svg");
@@ -99,7 +99,7 @@ def test_a_click_sorts_ascending_then_descending_then_not(page):
     assert state() == ("none", before)
 
 
-def test_words_are_sorted_and_another_header_takes_over(page):
+def test_words_are_sorted_and_another_header_replaces_the_first(page):
     table = "table-seeds"
     page.run(f"{HEADER}({[table, 'task']}).querySelector('button').click()")
     tasks = page.run(f"{COLUMN}({[table, 'task']})")
@@ -138,7 +138,7 @@ def test_nothing_hostile_has_run(page):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out(page, scheme):
+def test_text_has_enough_contrast(page, scheme):
     page.set_scheme(scheme)
     text, ground = page.run("[getComputedStyle(document.body).color, getComputedStyle(document.body).backgroundColor]")
 
@@ -160,5 +160,5 @@ def test_commands_can_be_copied(page):
     assert page.run("getSelection().toString()").startswith("python -m experiments.report")
 
 
-def test_it_prints(page):
+def test_the_page_prints_completely(page):
     assert len(page.pdf()) > 100_000

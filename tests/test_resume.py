@@ -42,7 +42,7 @@ def whole(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
-def test_a_run_goes_on_on_another_number_of_devices(tmp_path):
+def test_a_run_resumes_on_another_number_of_devices(tmp_path):
     assert run(tmp_path, *MEMBERS, "--steps=80", "--devices=2") == 0
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["devices"] == 2
     assert resumed(tmp_path, "--devices=1", "--steps=120") == 0
@@ -87,7 +87,7 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
     ],
     ids=["at the first evaluation", "in the warm-up", "at an evaluation", "between two", "at both"],
 )
-def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, capsys, whole, at, by):
+def test_an_interrupted_run_ends_like_a_run_without_a_break(tmp_path, monkeypatch, capsys, whole, at, by):
     interrupted(tmp_path, monkeypatch, at, by)
     assert f"--resume={path_in(tmp_path)}" in capsys.readouterr().out
     assert resumed(tmp_path) == 0
@@ -101,7 +101,7 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, ca
     assert [entry["env_steps"] for entry in config["resumed"]] == [at]
 
 
-def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_path, monkeypatch, whole):
+def test_the_same_command_with_resume_starts_the_run_and_resumes_it(tmp_path, monkeypatch, whole):
     interrupted(tmp_path, monkeypatch, 80)
     assert run(tmp_path, *MEMBERS, "--resume") == 0
     assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
@@ -109,7 +109,7 @@ def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_pat
     assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path / "new"))) == []
 
 
-def test_a_finished_run_stays_as_it_is(tmp_path, whole):
+def test_a_finished_run_does_not_change(tmp_path, whole):
     assert run(tmp_path, *MEMBERS) == 0
 
     def content():
@@ -140,7 +140,7 @@ def test_a_finished_run_is_resumed_for_more_steps(tmp_path):
     assert resumed(tmp_path, "--steps=200") == 0
 
 
-def test_a_diverged_member_stays_so(tmp_path, capsys):
+def test_a_diverged_member_stays_diverged(tmp_path, capsys):
     assert run(tmp_path, "--penalty_coef=0,1e38", "--checkpoint_every=20") == 3
     first = json.loads((path_in(tmp_path) / "summary.json").read_text())["diverged"]
     assert [entry["member"] for entry in first] == [2, 3]
@@ -153,7 +153,7 @@ def test_a_diverged_member_stays_so(tmp_path, capsys):
     assert [row["return_mean"] for row in late] == ["5.0", "5.0", "", ""]
 
 
-def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
+def test_a_run_without_checkpoints_is_rejected_and_not_changed(tmp_path, capsys):
     assert run(tmp_path, "--checkpoint_every=0") == 0
     assert not (path_in(tmp_path) / "checkpoint").exists()
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -164,7 +164,7 @@ def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("reached", "rejected"), [(0, False), (50, False), (100, False), (150, True)])
-def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, rejected):
+def test_a_run_that_lost_its_checkpoints_does_not_start_again(tmp_path, reached, rejected):
     """Evaluations every 50 steps, checkpoints every 50: of step 100 the row is there before the second checkpoint."""
     path = write_run(tmp_path, curves=[range(reached // 50 + 1)])
     if not rejected:
@@ -236,7 +236,7 @@ def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole
     assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
 
 
-def test_steps_that_cannot_be_are_rejected_and_the_run_stays_as_it_was(tmp_path, capsys):
+def test_invalid_steps_are_rejected_and_the_run_does_not_change(tmp_path, capsys):
     assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert resumed(tmp_path, "--steps=141") == 2
@@ -244,7 +244,7 @@ def test_steps_that_cannot_be_are_rejected_and_the_run_stays_as_it_was(tmp_path,
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatch):
+def test_a_resumed_run_has_no_summary_until_it_ends(tmp_path, monkeypatch):
     assert run(tmp_path, *MEMBERS) == 0
     seen = []
 
@@ -258,7 +258,7 @@ def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatc
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
 
 
-def test_a_run_is_evaluated_on_the_physics_that_it_began_with(tmp_path, monkeypatch):
+def test_a_resumed_run_is_evaluated_on_the_physics_of_its_start(tmp_path, monkeypatch):
     """Whatever --eval_physics=auto would choose on this machine, which is mujoco on a CPU."""
     path = write_run(tmp_path, physics="mujoco", versions=run_config.versions())
     content = json.loads((path / "config.json").read_text())

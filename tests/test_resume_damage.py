@@ -188,7 +188,7 @@ def contents(path):
     ],
     ids=["no checkpoint is whole", "another format", "the state of another step"],
 )
-def test_a_run_that_cannot_be_resumed_is_rejected_and_left_as_it_is(finished, tmp_path, capsys, damage, said, reason):
+def test_a_run_that_cannot_be_resumed_is_rejected_and_not_changed(finished, tmp_path, capsys, damage, said, reason):
     path = copied(finished, tmp_path)
     damage(path / "checkpoint")
     before = contents(tmp_path)
@@ -202,7 +202,7 @@ def test_a_run_that_cannot_be_resumed_is_rejected_and_left_as_it_is(finished, tm
     }
 
 
-def test_nothing_is_written_through_what_lies_in_the_way(finished, tmp_path, capsys):
+def test_nothing_is_written_through_links(finished, tmp_path, capsys):
     """Links under the names that a checkpoint has while it is written."""
     path = copied(finished, tmp_path)
     in_rows(Path.unlink)(path / "checkpoint")

@@ -106,7 +106,7 @@ def test_it_holds_the_newest_transitions_with_their_true_next_observations(num_e
 
 
 @given(num_envs=st.sampled_from([1, 3]), shortest=st.integers(2, 12), how_often=st.floats(0, 1), data=st.data())
-def test_where_episodes_are_shorter_than_was_said_old_transitions_go_and_none_is_wrong(
+def test_if_episodes_are_shorter_than_the_bound_old_transitions_are_lost_and_none_is_wrong(
     num_envs, shortest, how_often, data
 ):
     ring, insert, read = compiled(num_envs, shortest)
@@ -125,7 +125,7 @@ def test_where_episodes_are_shorter_than_was_said_old_transitions_go_and_none_is
     assert numbers.start <= max(15 * num_envs - CAPACITY, kept[0] if len(kept) == ring.final_capacity else 0)
 
 
-def test_room_for_final_observations_is_as_the_episodes_need_it():
+def test_room_for_final_observations_follows_from_the_episode_length():
     assert Ring(1000, O, A).final_capacity == 1001
     assert Ring(1_000_000, O, A, min_mean_episode_length=1000).final_capacity == 1001
     assert Ring(1000, O, A, num_envs=8, min_mean_episode_length=8).final_capacity == 133
@@ -144,7 +144,7 @@ def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
 
 
 @pytest.mark.parametrize("width", [1, 3, 4])
-def test_other_than_one_transition_per_environment_is_rejected(width):
+def test_any_number_but_one_transition_per_environment_is_rejected(width):
     ring = Ring(CAPACITY, O, A, num_envs=2)
     with pytest.raises(ValueError, match=r"expected transitions of {'obs': \(2, "):
         ring.insert(ring.init(), Stream(width).step(np.zeros(width, bool)))
@@ -161,7 +161,7 @@ def test_transitions_of_other_sizes_are_rejected(field):
 
 
 @pytest.mark.parametrize("capacity", [0, 1, 3, 13])
-def test_a_capacity_that_an_insert_could_straddle_is_rejected(capacity):
+def test_a_capacity_that_is_no_multiple_of_an_insert_is_rejected(capacity):
     with pytest.raises(ValueError, match=f"capacity .{capacity}. must be a multiple of the rows inserted at once .2."):
         Ring(capacity, O, A, num_envs=2).init()
 
@@ -202,7 +202,7 @@ def test_members_have_their_own_of_every_field_except_the_number_of_inserted_tra
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=8)
-def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, steps, how_often, seed):
+def test_rows_saved_one_part_after_another_restore_everything(num_envs, shortest, steps, how_often, seed):
     ring, insert, read = compiled(num_envs, shortest)
     generator = np.random.default_rng(seed)
     state, stream, kept = ring.init(), Stream(num_envs), []
@@ -230,7 +230,7 @@ def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, ste
         np.testing.assert_array_equal(a, b)
 
 
-def test_without_rows_leaves_what_is_small():
+def test_without_rows_only_small_arrays_remain():
     ring = Ring(10_000, O, A, min_mean_episode_length=1000)
     state = ring.init()
     rest = ring.without_rows(state)

@@ -42,7 +42,7 @@ def test_a_processor_is_a_device_for_each_member(tmp_path):
     assert devices_of_a_run(*run) == (members, members)
 
 
-def test_a_processor_is_a_device_for_each_member_of_a_run_that_goes_on(tmp_path):
+def test_a_processor_is_a_device_for_each_member_of_a_resumed_run(tmp_path):
     members = 2 * usable_cores() + 1
     path = test_plan.begun(tmp_path, "a", "--replay_capacity=10000", seeds(members))
     assert devices_of_a_run(f"--resume={path}") == (members, members)

@@ -76,7 +76,7 @@ def accepts_own_environments():
 
 
 @pytest.mark.skipif(not accepts_own_environments(), reason="make_config does not accept physics own yet")
-def test_after_the_merge_runs_of_an_own_environment_are_read_from_disk(tmp_path):
+def test_runs_of_an_own_environment_are_read_from_disk(tmp_path):
     path = write_run(tmp_path, env="point", physics="own")
     content = json.loads((path / "config.json").read_text()) | {"evaluated_on": "own"}
     (path / "config.json").write_text(json.dumps(content))

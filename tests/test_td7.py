@@ -129,7 +129,7 @@ def test_the_running_bounds_are_those_of_all_targets_and_come_into_use_at_copies
 # An update
 
 
-def test_copies_are_hard_take_all_that_the_update_made_and_lag_in_the_encoders():
+def test_copies_are_hard_follow_the_update_and_lag_in_the_encoders():
     states = run(open_bounds(init()), 2 * PERIOD + 1)
     for k, (before, after) in enumerate(zip(states, states[1:], strict=False), start=1):
         assert not same(before.encoder, after.encoder)
@@ -154,7 +154,7 @@ def changed(states, other):
     }
 
 
-def test_what_the_encoder_learns_is_felt_one_copy_later_and_by_the_target_two():
+def test_the_encoders_learning_reaches_the_critics_one_copy_later_and_the_target_two():
     start = open_bounds(init())
     other = start._replace(encoder=init(1).encoder)
     first = changed(run(start, 2 * PERIOD + 1), run(other, 2 * PERIOD + 1))
@@ -257,7 +257,7 @@ def by_hand(policy, obs):
     return ACTOR.apply(policy.actor, obs, ENCODER.zs(policy.encoder, obs))
 
 
-def test_the_snapshot_behaves_and_the_checkpoint_is_evaluated(three_policies):
+def test_the_snapshot_acts_and_the_checkpoint_is_evaluated(three_policies):
     state, obs = three_policies, make_batch(0).obs
     behaviour, evaluation = (AGENT.act(state, obs, KEY, deterministic=flag) for flag in (False, True))
     np.testing.assert_allclose(behaviour, by_hand(state.checkpoints.snapshot, obs), rtol=1e-5, atol=1e-6)
@@ -274,7 +274,7 @@ def test_the_exploration_noise_is_added_to_the_snapshots_action():
     assert abs(float(noise.mean())) < 0.005 and abs(float(noise.std()) - 0.1) < 0.005
 
 
-def test_learning_leaves_snapshot_and_checkpoint_alone(three_policies):
+def test_learning_does_not_change_snapshot_and_checkpoint(three_policies):
     before, after = three_policies, run(three_policies, PERIOD + 1)[-1]
     assert same(after.checkpoints.snapshot, before.checkpoints.snapshot)
     assert same(after.checkpoints.checkpoint, before.checkpoints.checkpoint)
@@ -302,7 +302,7 @@ def test_past_the_switch_of_gradient_steps_one_episode_does_not_end_an_assessmen
     assert late.checkpoints.assessments == 1
 
 
-def test_episodes_of_several_environments_are_refused(three_policies):
+def test_episodes_of_several_environments_are_rejected(three_policies):
     with pytest.raises(ValueError, match=r"td7 expects one environment: .* not \(2,\)"):
         AGENT.observe(three_policies, jnp.array([5.0, 6.0]), jnp.array([True, False]), 0)
 

@@ -11,7 +11,7 @@ import pytest
 from sqt_jax.envs.physics.threads import thread_pool, usable_cores
 
 
-def test_all_cores_count_if_the_system_does_not_say_which_may_be_used(monkeypatch):
+def test_all_cores_count_if_the_system_does_not_limit_them(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     assert usable_cores() == os.cpu_count()
 

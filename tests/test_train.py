@@ -145,7 +145,7 @@ def test_chunks_change_nothing_at_all(td3):
     assert identical(whole, state) and identical(sweep.measure(whole), sweep.measure(state))
 
 
-def test_what_is_measured_is_of_the_interval(td3):
+def test_metrics_are_of_the_interval(td3):
     config, _, sweep = td3
     state, warm = advance(sweep, start(config, sweep), 40, False)
     parts = []
@@ -211,7 +211,7 @@ def test_a_seed_trains_alone_as_in_a_sweep(algo):
 
 
 @algorithm_rows.every(PENALISED, fast=("td3_sqt_tuple",))
-def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(algo):
+def test_coef_0_trains_bit_identically_to_the_baseline_and_others_do_not(algo):
     plain = algo.removesuffix("_tuple").removesuffix("_sqt")
     trained = {}
     for name, coef in [(plain, 0.0), (algo, 0.0), (algo, 0.5)]:
@@ -232,7 +232,7 @@ def test_the_same_seeds_twice_are_bit_identical(td3):
     assert identical(*runs)
 
 
-def test_evaluation_leaves_the_state_alone_and_draws_new_starts_each_time(td3):
+def test_evaluation_does_not_change_the_state_and_draws_new_starts_each_time(td3):
     config, _, sweep = td3
     state, _ = advance(sweep, start(config, sweep), 40, False)
     copy = numbers(state)
@@ -288,7 +288,7 @@ def test_evaluation_steps_and_segments():
     assert train.segments(0, 20_000, odd) == [(3500, False), (6500, True)]
 
 
-def test_memory_estimate_is_the_size_of_what_is_held():
+def test_memory_estimate_is_the_size_of_replay_and_agents():
     config, _, sweep = make("td3")
     state = start(config, sweep)
     agent = sum(leaf.nbytes for leaf in numbers(state.agent))
@@ -354,14 +354,14 @@ def test_truncation_bootstraps_and_termination_does_not(algo):
     assert values[probe_envs.countdown] == pytest.approx((1 + 1.9 + 2.71) / 3, rel=0.1)
 
 
-def test_an_environment_may_call_its_fields_as_it_likes():
+def test_an_environment_may_have_any_field_names():
     """`inserted` is a counter that members share in the replay, and each member's own in an environment."""
     config, _, sweep = make("td3", probe_envs.with_a_field_called_inserted)
     state, metrics = advance(sweep, start(config, sweep), 50, True)
     assert state.timestep.state.task.inserted.shape == (3, 1) and (metrics["train_episodes"] > 0).all()
 
 
-def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):
+def test_a_member_that_diverges_is_frozen_and_the_others_continue(td3):
     config, _, sweep = td3
     whole, seeds = start(config, sweep, range(5)), range(5)
     whole = sweep.advance(sweep.advance(whole, 40, False), 20, True)
@@ -383,7 +383,7 @@ def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):
     assert np.isfinite(hurt.timestep.obs).all()
 
 
-def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
+def test_the_bias_distinguishes_overestimation_from_underestimation(monkeypatch):
     """The true value is 5 everywhere. The largest of five critics overestimates, a strong penalty underestimates."""
     settings = {"ensemble_size": 5, "warmup_steps": 100, "lr": 3e-3, "tau": 0.1, "gamma": 0.8, "steps": 1_000}
     found = {}
@@ -407,7 +407,7 @@ def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["sac", "td7"])
-def test_critics_are_judged_by_the_policy_whose_values_they_estimate(algo):
+def test_the_bias_is_measured_for_the_policy_whose_values_critics_estimate(algo):
     """SAC's critics by its samples, entropy included; TD7's by the checkpoint, which is what evaluation plays."""
     small = {"embedding_size": 16} if algo == "td7" else {}
     config, _, sweep = make(algo, functools.partial(probe_envs.countdown, 3), **small)
