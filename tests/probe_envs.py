@@ -31,7 +31,7 @@ def shorter_than_it_says() -> Environment:
 
 @functools.cache  # the same environment is the same object, so that its runs can share their programs
 def constant_reward(episode_length: int = 5) -> Environment:
-    """Reward 1 for ever; only the time limit ends episodes, so Q = 1 / (1 - gamma) everywhere."""
+    """Reward 1 at each step; only the time limit ends episodes, so Q = 1 / (1 - gamma) everywhere."""
 
     def start(key):
         obs = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
@@ -62,7 +62,7 @@ class Named(NamedTuple):
 
 
 def with_a_field_called_inserted() -> Environment:
-    """A state with a field of the name of one of the trainer's counters."""
+    """A state with a field that has the name of one of the trainer's counters."""
 
     def start(key):
         value = jax.random.uniform(key, minval=1.0, maxval=2.0)
@@ -75,7 +75,7 @@ def with_a_field_called_inserted() -> Environment:
 
 
 def diverging() -> Environment:
-    """An action above 0 makes an observation that is not a number, and an infinite reward; others earn 1."""
+    """An action above 0 makes the observation NaN and the reward infinite; other actions earn 1."""
 
     def start(key):
         obs = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)

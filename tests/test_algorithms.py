@@ -1,4 +1,4 @@
-"""The table of algorithms: its names, its rows, and that the functions of a name are those of its row."""
+"""The table of algorithms: its names, its rows, and the functions that belong to a name."""
 
 import dataclasses
 
@@ -122,7 +122,7 @@ def test_settings_override_the_row():
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_any_penalty_but_that_of_the_algorithms_name_is_rejected(algo):
-    """A run would be another algorithm than its name says."""
+    """Otherwise a run would train another algorithm than its name says."""
     own = make_config(algo, "ant").agent.penalty
     for penalty in ("none", "batch_std", "transition_std"):
         if penalty == own:
@@ -161,7 +161,7 @@ def test_a_custom_environment_gives_the_sizes(algo):
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_row_makes_a_complete_run(algo):
-    """Traced, not compiled: that every part of the row fits the train loop."""
+    """Traced, not compiled: every part of the row fits the train loop."""
     env = constant_reward()
     config = make_config(algo, "ant", hidden=(5, 4), steps=1000, warmup_steps=300, eval_every=500, eval_episodes=2)
     state, history = jax.eval_shape(jax.vmap(make_train(config, env)), jax.random.split(jax.random.key(0), 3))

@@ -1,3 +1,5 @@
+"""Command lines of the commands that read runs: flags, error lines, exit codes, written files."""
+
 import argparse
 
 import pytest
@@ -47,10 +49,10 @@ def test_invalid_arguments_are_rejected_in_one_line(parser, argv, message):
 
 
 def test_exit_codes(parser, capsys):
-    def refuse(argv):
+    def reject(argv):
         raise UsageError("--out=a\nb: no")
 
-    assert guarded(refuse, []) == 2
+    assert guarded(reject, []) == 2
     assert capsys.readouterr().err == "--out=a\\nb: no\n"
     assert guarded(parser.read, ["tables", "--help"]) == 0
     shown = capsys.readouterr().out

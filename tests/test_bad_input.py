@@ -35,7 +35,7 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def folder(finished, tmp_path, monkeypatch):
-    """The working directory: a copy of the finished run, and files that are none of a run."""
+    """The working directory: a copy of the finished run, and files that do not belong to a run."""
     shutil.copytree(finished, tmp_path / "runs")
     (tmp_path / "file").write_text("mine")
     (tmp_path / "empty").mkdir()
@@ -44,7 +44,7 @@ def folder(finished, tmp_path, monkeypatch):
 
 
 def snapshot(path):
-    """All that is below a folder: names, bytes and where links lead."""
+    """The contents of a folder: names, bytes and the targets of links."""
     found = {}
     for item in path.rglob("*"):
         link = item.readlink() if item.is_symlink() else None
@@ -133,7 +133,7 @@ def test_an_invalid_flag_is_rejected(folder, capsys, argument, begins, expects):
     rejected(folder, capsys, [*NEW.split(), argument], begins, expects)
 
 
-# Flags that do not go together
+# Flags that exclude each other
 
 TOGETHER = [
     ("--algo=sac --penalty_coef=0.5", "--penalty_coef:", "has no effect with sac"),
@@ -200,7 +200,7 @@ FILES = {
 def test_an_invalid_file_of_flags_is_rejected(folder, capsys, case):
     content, expects = FILES[case]
     (folder / "flags.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
-    given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would win
+    given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would override it
     rejected(folder, capsys, [*given, "--config=flags.yaml"], "--", expects)
 
 
@@ -237,7 +237,7 @@ def without(key):
     return lambda config: config.pop(key)
 
 
-# What is changed in config.json.
+# Changes of config.json.
 CHANGED = {
     "unknown setting": (settings(stepz=5), "--stepz: is not a setting"),
     "setting out of range": (settings(gamma=2), "--gamma: expects a number from 0 to 1"),
@@ -310,7 +310,7 @@ def a_folder(name):
     return damage
 
 
-# What is done to a run's folder, given its config.json.
+# Damage to a run's folder, as a function of its config.json.
 DAMAGED = {
     "no config": (Path.unlink, "it has no config.json"),
     "truncated": (truncated, "does not describe a run"),
@@ -340,12 +340,12 @@ DAMAGED = {
 def test_a_damaged_run_is_rejected(folder, capsys, case):
     damage, expects = DAMAGED[case]
     damage(RUN / "config.json")
-    further = ["--steps=160"] if case.startswith("table") else []  # else it is finished, and left as it is
+    further = ["--steps=160"] if case.startswith("table") else []  # otherwise the run is finished and not changed
     rejected(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", expects)
 
 
 ITS_OWN = r"expects the run's own settings; these differ: "
-# The run is whole; `RUN` stands for its folder, `NEW` for the flags that made it.
+# The run is complete; `RUN` stands for its folder, `NEW` for the flags that made it.
 RESUMED = [
     ("--resume=none", "--resume=none:", "expects the folder of a run"),
     ("--resume=file", "--resume=file:", "expects the folder of a run"),

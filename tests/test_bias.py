@@ -59,7 +59,7 @@ def test_bonuses_count_from_the_next_action_on():
 
 
 def test_the_last_states_of_a_truncated_episode_do_not_count():
-    # Q = 1 / (1 - gamma) for ever; of 40 steps those count after which 0.5^steps is at most 1 %: the first 34.
+    # Q = 1 / (1 - gamma) everywhere; of 40 steps those count after which 0.5^steps is at most 1 %: the first 34.
     _, found = measure(constant_reward(40), lambda obs: jnp.full((1, len(obs)), 2.0), 0.5)
     exact = np.mean([2 - (2 - 2 * 0.5 ** (40 - step)) for step in range(34)])
     np.testing.assert_allclose(found[0], exact, rtol=1e-3)

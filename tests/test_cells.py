@@ -1,3 +1,5 @@
+"""Numbers and footnotes of result tables."""
+
 import pytest
 
 from experiments.evidence.cells import Notes, finite, interval, joined, number

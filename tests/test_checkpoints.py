@@ -20,12 +20,12 @@ from sqt_jax.algorithms import ALGORITHMS, replay_of
 from sqt_jax.members import Layout
 
 SEEDS = (0, 1, 2)
-CAPACITY = 64  # less than the steps: the ring goes round
+CAPACITY = 64  # fewer than the steps: the ring overwrites rows
 LENGTHS = {"evaluations": 10, "metrics": 20}
 
 
 class Case:
-    """A small sweep, and states of it."""
+    """A small sweep and its states."""
 
     def __init__(self, algo="td3_sqt", devices=1, make_env=probe_envs.one_step, **settings):
         small = {"embedding_size": 16} if "checkpoints" in ALGORITHMS[algo].features else {}
@@ -48,7 +48,7 @@ class Case:
         return CheckpointStore(folder / "checkpoint", self.replay, self.layout, keep, self.said.append)
 
     def saved(self, store, *steps):
-        """Saves at these steps of one training; the state at the last of them."""
+        """Saves at these steps of one training; returns the state at the last one."""
         state = self.trained(40)
         for at in steps:
             state = self.advance(state, at - int(state.env_steps), at > 40)
@@ -58,7 +58,7 @@ class Case:
 
 
 def same(one, other):
-    """Bit for bit, except final observations that no transition needs any more: a checkpoint does not hold those."""
+    """Bit for bit, except final observations that no transition needs any more, which a checkpoint leaves out."""
 
     def held(state):
         replay = state.replay
@@ -85,7 +85,7 @@ def listing(store):
     return sorted(path.name for path in store.path.iterdir())
 
 
-@algorithm_rows.every(fast=("td7_sqt_tuple",))  # the other tests here take td3_sqt
+@algorithm_rows.every(fast=("td7_sqt_tuple",))  # the other tests here use td3_sqt
 def test_every_algorithm_resumes_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)
@@ -109,7 +109,7 @@ def test_training_continues_while_a_checkpoint_is_written(case, tmp_path):
     store = case.store(tmp_path)
     state = case.trained(60)
     store.save(state, position(60), LENGTHS)
-    case.sweep.advance(state, 20, True)  # donates the memory of what is being written
+    case.sweep.advance(state, 20, True)  # donates the memory of the arrays being written
     store.wait()
     assert same(store.restore(case.template).state, case.trained(60))
 
@@ -194,7 +194,7 @@ def test_a_full_disk_does_not_stop_training(case, tmp_path, fault):
     assert "no checkpoint at step 70" in warning and "No space left" in warning
     assert "the last valid one is at step 60" in warning
     assert not [name for name in listing(store) if name.endswith(".part")]
-    # The older one is as good as before, and with room again there is a newer one.
+    # The older one is still valid, and with room again there is a newer one.
     state = case.sweep.advance(state, 10, True)
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(60))
     store = case.store(tmp_path)
@@ -241,13 +241,13 @@ def test_incomplete_files_of_a_dead_process_are_removed(case, tmp_path):
     before = listing(store)
     store = case.store(tmp_path)
     assert same(store.restore(case.template).state, state)
-    assert listing(store) == before  # not before it is known that the run goes on
+    assert listing(store) == before  # nothing is removed before the run certainly resumes
     store.remove_others()
     assert listing(store) == ["notes.txt", "rows_0000000000_0000000060.bin", "step_0000000060"]
 
 
 def test_the_rows_of_older_checkpoints_outlive_a_resume(case, tmp_path):
-    """The ring goes round between the two: the later one does not need the first rows."""
+    """The ring overwrites rows between the two: the later one does not need the first rows."""
     case.saved(case.store(tmp_path), 60, 130)
     store = case.store(tmp_path)
     store.restore(case.template)
@@ -347,7 +347,7 @@ def test_keys_are_restored_as_keys(case, tmp_path):
 
 
 def test_empty_arrays_are_restored_too(case, tmp_path):
-    """Brax's environments carry some."""
+    """Brax's environments have some."""
 
     def with_one(state):
         return state._replace(timestep=(state.timestep, jnp.zeros((len(SEEDS), 0, 2), jnp.int32)))

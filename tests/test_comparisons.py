@@ -1,3 +1,5 @@
+"""Comparisons with baselines by hand: percentages, probabilities, intervals, footnotes."""
+
 import pytest
 from made_runs import write_run
 from table_reader import cells

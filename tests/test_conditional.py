@@ -59,7 +59,7 @@ def test_unbatched_arguments_are_shared():
 
 
 def test_the_compiled_loop_has_a_real_branch():
-    """One conditional, and no select of the state outside of it."""
+    """One conditional, and no select of the state outside."""
 
     def loop(old, given):
         def body(i, old):

@@ -1,4 +1,4 @@
-"""Defaults, limits and their messages, and the way of a configuration through a file."""
+"""Defaults, limits and their messages, and a configuration written to a file and read back."""
 
 import json
 import pickle
@@ -48,7 +48,7 @@ def user(settings):
     return next(a for a in ("sac_sqt", "td7_sqt", "redq_sqt", "sac") if all(has_effect(a, name) for name in settings))
 
 
-REFUSED = [
+REJECTED = [
     ("penalty_coef", {"penalty_coef": -0.1}),
     ("penalty_coef", {"penalty_coef": float("nan")}),
     ("penalty_coef", {"penalty_coef": float("inf")}),
@@ -122,7 +122,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("setting", "settings"), REFUSED, ids=str)
+@pytest.mark.parametrize(("setting", "settings"), REJECTED, ids=str)
 def test_invalid_settings_are_rejected_by_name(setting, settings):
     with pytest.raises(ConfigError) as error:
         make_config(user(settings), "ant", **settings)
@@ -133,7 +133,7 @@ def test_invalid_settings_are_rejected_by_name(setting, settings):
 
 def test_every_limited_setting_is_among_the_rejected():
     assert set(SETTINGS) - {"eval_physics", "squashed_log_prob"} <= {
-        name for _, settings in REFUSED for name in settings
+        name for _, settings in REJECTED for name in settings
     }
 
 
@@ -148,7 +148,7 @@ def test_every_setting_has_help_and_says_what_it_expects():
 @pytest.mark.parametrize(
     "settings",
     [
-        {"penalty_coef": 0},  # an int where a number is taken
+        {"penalty_coef": 0},  # an int where a number is expected
         {"gamma": 1.0, "tau": 1.0, "temperature": 0.0, "warmup_steps": 0},
         {"ddof": 0},
         {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5},

@@ -1,4 +1,4 @@
-"""A file of settings is the command line that it stands for, or is rejected (hostile files: test_bad_input.py)."""
+"""A file of settings becomes the same command line, or is rejected (hostile files: test_bad_input.py)."""
 
 import pytest
 

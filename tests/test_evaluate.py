@@ -116,7 +116,7 @@ def test_members_evaluate_in_a_sweep_as_they_do_alone():
 
 
 def test_a_policy_has_the_same_return_in_gymnasiums_environment_and_in_ours():
-    """A policy under which the hopper falls at once, whatever the start: lengths and returns lie close together."""
+    """A policy under which the hopper falls at once, from any start: lengths and returns hardly vary."""
     import gymnasium
 
     weights = 0.3 * jax.random.normal(jax.random.key(1), (11, 3))
@@ -136,7 +136,7 @@ def test_a_policy_has_the_same_return_in_gymnasiums_environment_and_in_ours():
 
 
 class Ladder:
-    """In Gymnasium's form: reward is the action as the environment sees it, 3 steps, actions from 0 to 10."""
+    """With Gymnasium's interface: the reward is the action that the environment gets, 3 steps, actions from 0 to 10."""
 
     class action_space:
         low, high = np.zeros(1, np.float32), np.full(1, 10, np.float32)

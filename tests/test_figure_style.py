@@ -1,3 +1,5 @@
+"""Colours, lines and panels of figures."""
+
 import numpy as np
 from figure_reader import legend_of, panels
 from made_runs import write_run

@@ -1,3 +1,5 @@
+"""Figures show the numbers of the runs: curves, bands, sweeps, profiles."""
+
 import numpy as np
 import pytest
 from figure_reader import legend_of, panels, pixels_of
@@ -120,7 +122,7 @@ def test_runs_that_differ_in_more_than_the_coefficient_are_no_sweep(tmp_path, ot
 
 
 def test_profile_by_hand(tmp_path):
-    # Against the best mean, 10: half of td3's seeds lie above 0.5, and half of sac's above 1.
+    # Against the best mean, 10: half of td3's seeds are above 0.5, and half of sac's above 1.
     write_run(tmp_path, "td3", curves=[[0, 0, 4], [0, 0, 8]])
     write_run(tmp_path, "sac", curves=[[0, 0, 5], [0, 0, 15]])
     write_run(tmp_path, "td7", curves=[[NAN, NAN, NAN]])

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, folders that one process writes, and reading what may be damaged."""
+"""Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
 
 import json
 import os

@@ -15,12 +15,12 @@ from experiments.playing.film_formats import FORMATS
 from sqt_jax.envs.gym_table import TASKS
 from sqt_jax.envs.gym_tasks import load_model
 
-HEIGHT, WIDTH = 34, 50  # even, and not the multiples of 16 that encoders like best
+HEIGHT, WIDTH = 34, 50  # even, and not multiples of 16, which encoders prefer
 PERIODS = {load_model(task).opt.timestep * task.frame_skip for task in TASKS.values()}
 
 
 def pictures(count=12):
-    """A white bar that walks to the right, on a ground whose colour changes."""
+    """A white bar that moves to the right, on a background whose colour changes."""
     for number in range(count):
         picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         picture[:] = 20 * number, 60, 200 - 10 * number
@@ -29,7 +29,7 @@ def pictures(count=12):
 
 
 def decoded(path):
-    """What ffmpeg says of a film, and its pictures."""
+    """ffmpeg's text about a film, and its pictures."""
     # not by imageio_ffmpeg.read_frames, which forks
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     done = subprocess.run(command, capture_output=True, check=True)

@@ -1,3 +1,5 @@
+"""Finding runs below folders, and reading their files."""
+
 import json
 import shutil
 

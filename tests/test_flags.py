@@ -1,3 +1,5 @@
+"""The command line as `Options`: types, defaults, sweeps, files of flags, error lines."""
+
 import os
 import subprocess
 import sys

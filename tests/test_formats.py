@@ -1,3 +1,5 @@
+"""Result tables as Markdown, CSV, LaTeX and text."""
+
 import csv
 import io
 import re

@@ -12,7 +12,7 @@ def row(point, rate):
 
 
 def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
-    """And each line is measured interleaved."""
+    """The points of each line are measured interleaved."""
     made, lines = [], []
 
     def measure_cases(cases, **timing):

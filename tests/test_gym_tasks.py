@@ -1,4 +1,4 @@
-"""The pieces of the locomotion tasks by hand; whole steps are compared in test_gymnasium_parity."""
+"""The parts of the locomotion tasks by hand; complete steps are compared in test_gymnasium_parity."""
 
 import itertools
 import sys
@@ -119,7 +119,7 @@ def test_actions_are_scaled_to_the_actuators_range(name, recording_physics):
     np.testing.assert_allclose(timestep.state.task.internal, limit * action, rtol=1e-6)
     expected = TASKS[name].alive - TASKS[name].ctrl_cost * np.sum((limit * np.asarray(action)) ** 2)
     expected += TASKS[name].height * float(timestep.state.task.qpos[2])
-    np.testing.assert_allclose(timestep.reward, expected, rtol=1e-5)  # the cost is that of the stretched action
+    np.testing.assert_allclose(timestep.reward, expected, rtol=1e-5)  # the cost is that of the scaled action
     excess = env.step(env.reset(jax.random.key(0)), 5 * jnp.ones(env.action_size))
     np.testing.assert_allclose(excess.state.task.internal, limit, rtol=1e-6)
 
@@ -184,7 +184,7 @@ def test_no_constant_action_at_its_limits_makes_a_robot_fall_sooner_than_the_rep
         lengths[tuple(corner)] = steps / 3
     shortest = min(lengths.values())
     assert shortest >= MIN_STEPS_TO_FALL
-    assert name not in ("hopper", "walker") or shortest < 7  # it is a tight one
+    assert name not in ("hopper", "walker") or shortest < 7  # the bound is tight
 
 
 @pytest.mark.parametrize("name", ["cheetah", "walker", "ant", "hopper", "swimmer"])

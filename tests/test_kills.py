@@ -8,7 +8,7 @@ from experiments.endurance.training_process import TASKS
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
-    """A training without a break (two, in fact: the same command twice is bit-identical)."""
+    """A training without a break (in fact two: the same command twice is bit-identical)."""
     return train_reference("tiny", "td3_sqt", tmp_path_factory.mktemp("reference") / "run")
 
 

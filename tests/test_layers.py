@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# From the ground up; a module imports from lower layers only, or from its own package further down.
+# The lowest first; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
     {"sqt_jax.types", "sqt_jax.suggestions"},
     {"sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
@@ -63,7 +63,7 @@ OWN_LAYER = {
     "experiments.evidence.statistics",
     "experiments.running.session",  # draws the curves of a finished run
 }
-# Beyond the order of the layers.
+# Further rules.
 REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
 NETWORKS = ("sqt_jax.networks", "sqt_jax.gaussian", "sqt_jax.sale", "sqt_jax.q_targets")
 NEVER = {
@@ -77,7 +77,7 @@ NEVER = {
     "sqt_jax.rollout": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
     "sqt_jax.evaluate": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
 }
-# What an agent may import from others: TD7 is TD3's successor, and the released code varies all three.
+# The agents that an agent may import: TD7 is TD3's successor, and the released code varies all three.
 AGENTS = {
     "critic": (),
     "policy_checkpoints": (),
@@ -100,7 +100,7 @@ MODULES = modules("sqt_jax") | modules("experiments")
 
 
 def imports(source: str, package: str, known=frozenset(MODULES)) -> set[str]:
-    """The modules of this repository that a source text imports, wherever in it."""
+    """The modules of this repository that a source text imports, anywhere in it."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

@@ -1,3 +1,5 @@
+"""The host loop, with a sweep that only counts: evaluations, chunks, checkpoints, signals, divergence."""
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from sqt_jax.train import Sweep, TrainState
 
 
 class Recorder:
-    """Two members, a sweep that counts instead of training (a second per 100 steps), and a display that keeps quiet."""
+    """Two members, a sweep that counts instead of training (a second per 100 steps), and a silent display."""
 
     def __init__(self, train, breaks_at=None):
         self.train, self.breaks_at = train, breaks_at
@@ -130,8 +132,8 @@ def test_time_left_is_a_lower_bound_until_an_evaluation_was_timed():
     recorder = Recorder(TrainConfig(steps=2_000, warmup_steps=100, eval_every=1_000))
     recorder.run()
     training = [status for status in recorder.statuses if status.phase == "training"]
-    for status in training[1:]:  # of the first, which was not timed before, nothing is known
-        assert status.left.at_least == (status.env_steps < 1_000)  # the first evaluation's time is its compilation's
+    for status in training[1:]:  # nothing was timed before the first
+        assert status.left.at_least == (status.env_steps < 1_000)  # the first evaluation's time is compilation
 
 
 def test_a_stopped_run_reports_its_last_interval():

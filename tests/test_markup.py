@@ -1,3 +1,5 @@
+"""HTML elements, inline figures and complete pages; no text becomes markup."""
+
 import base64
 import hashlib
 import re

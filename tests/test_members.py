@@ -1,4 +1,4 @@
-"""Members along devices: how many each holds, and that nothing depends on where they lie."""
+"""Members along devices: how many each holds, and results do not depend on the device."""
 
 import math
 import os
@@ -38,7 +38,7 @@ def test_shares_are_equal(count, devices, held):
         (4, 4, 4),
         (8, 5, 5),
         (32, 25, 25),
-        (4, 5, 3),  # shares of two: the fourth would hold copies alone
+        (4, 5, 3),  # shares of two: the fourth would hold copies only
         (4, 7, 4),
         (8, 17, 6),
     ],
@@ -95,7 +95,7 @@ def test_each_device_holds_only_its_share(both):
     _, (_, (_, state)) = both
     for leaf in jax.tree.leaves((state.agent.actor, state.replay)):
         if not leaf.ndim:
-            continue  # a counter, which all share
+            continue  # a shared counter
         assert {shard.device for shard in leaf.addressable_shards} == set(DEVICES)
         assert [shard.data.shape[0] for shard in leaf.addressable_shards] == [2, 2]
 
@@ -133,7 +133,7 @@ def test_members_train_over_two_processes_as_in_one(tmp_path):
         for process in started:
             output, _ = process.communicate(timeout=240)
             assert process.returncode == 0, output
-    finally:  # where one ended or hangs, the other waits for it
+    finally:  # if one ended or hangs, the other waits for it
         for process in started:
             process.kill()
             process.wait()

@@ -43,7 +43,7 @@ def test_a_step_is_a_function_of_the_state_it_is_given(ant):
     physics, model, advance = ant
     state, control = robots(physics, model, 7)
     once = advance(state, control)
-    advance(once, -control)  # leaves its marks in MuJoCo's own memory
+    advance(once, -control)  # changes MuJoCo's own memory
     assert same(advance(state, control), once)
     order = np.random.default_rng(0).permutation(7)
     shuffled = advance(jax.tree.map(lambda leaf: leaf[order], state), control[order])
@@ -123,7 +123,7 @@ def test_the_state_is_carried_in_float64(ant):
 def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     env = envs.make("ant", "mujoco")
-    gym_tasks.load_model(TASKS["cheetah"])  # which has to do with MuJoCo's warnings too
+    gym_tasks.load_model(TASKS["cheetah"])  # it sets MuJoCo's warning handler too
     timestep = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
     qvel = timestep.state.task.qvel.at[1, 2].set(fault)
     broken = jax.vmap(env.set_physics)(timestep.state.task.qpos, qvel)

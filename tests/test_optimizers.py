@@ -1,4 +1,4 @@
-"""Adam against optax's own, the soft step of target networks, and that neither moves what has diverged."""
+"""Adam against optax's own, the soft step of target networks, and that neither changes a diverged agent."""
 
 import jax
 import jax.numpy as jnp

@@ -1,3 +1,5 @@
+"""The report as a page: its parts, links, sort keys."""
+
 from datetime import UTC, datetime
 
 import pytest

@@ -1,3 +1,5 @@
+"""Tables 2 to 4 and the table of seeds by hand."""
+
 from made_runs import write_run
 from table_reader import cells
 
@@ -110,7 +112,7 @@ def test_published_figures_are_below_ours_with_version_and_source(tmp_path):
     rows = [row for row in cells(table)]
     assert table.header[1:3] == ["humanoid", "ant-v5"]
     labels = [row[0] for row in rows]
-    # Those of the baseline, of which there is no run; then ours and its own.
+    # Published numbers of the baseline, which was not run; then our row and its published numbers.
     assert labels[0].startswith("published: td3, environment v3, 10 seeds|Tianshou")
     ours = labels.index("td3_sqt")
     released = rows[ours + 1]

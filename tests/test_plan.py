@@ -130,7 +130,7 @@ DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints":
         ({"devices": 99}, ["--devices=1"], {"devices": 1}),
         ({"devices": 0}, [], {}),
         ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
-        # What no command line could have given counts as not there.
+        # Values that no command line could have given are ignored.
         ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
         ({"checkpoint_every": "often", "keep_checkpoints": True, "tensorboard": None, "more": 1}, [], {}),
     ],
@@ -182,7 +182,7 @@ def test_default_devices_are_chosen_again_when_a_run_resumes(tmp_path, monkeypat
     assert len(plan(tmp_path, f"--resume={named}", "--devices=1", new="").layout.devices) == 1
 
 
-# An environment handed in. Needs `make_config` to accept an `Environment`, and `flags.parse(argv, needs_env=False)`.
+# An environment handed in
 
 OWN = NEW.replace("--env=ant ", "")
 

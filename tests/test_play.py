@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A run of two seeds, 3 and 5, of which 5 is the better; one of Brax's; and a folder of another kind."""
+    """A run of two seeds, 3 and 5, of which 5 is the better; one of Brax's; and a folder without a run."""
     folder = tmp_path_factory.mktemp("runs")
     path = write_run(folder, "td3", "hopper", [[0, 1], [0, 2]], seeds=(3, 5), hidden=(8, 8))
     add_policies(path, envs.make("hopper", "mujoco"), [1, 2])

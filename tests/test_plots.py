@@ -1,3 +1,5 @@
+"""The plots command."""
+
 import pytest
 from made_runs import write_run
 from matplotlib.image import imread

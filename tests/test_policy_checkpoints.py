@@ -1,4 +1,4 @@
-"""TD7's policy checkpoints by hand: what the end of an episode does to snapshot, checkpoint and counters."""
+"""TD7's policy checkpoints by hand: snapshot, checkpoint and counters after the end of an episode."""
 
 import jax
 import jax.numpy as jnp
@@ -45,10 +45,10 @@ def test_before_the_switch_each_episode_is_an_assessment():
     _, rows = story(START, 5.0, 3.0, 7.0, 7.0, -2.0)
     assert rows == [
         # snapshot, checkpoint, best, min, episodes, assessments, refreshes
-        (1, 0, 5, 1e8, 0, 1, 1),  # the policy that was assessed is the checkpoint, not the learner of now
-        (2, 0, 5, 1e8, 0, 2, 1),  # worse: 1 is given up
+        (1, 0, 5, 1e8, 0, 1, 1),  # the checkpoint is the assessed policy, not the current learner
+        (2, 0, 5, 1e8, 0, 2, 1),  # worse: policy 1 is dropped
         (3, 2, 7, 1e8, 0, 3, 2),
-        (4, 3, 7, 1e8, 0, 4, 3),  # as good is good enough
+        (4, 3, 7, 1e8, 0, 4, 3),  # an equal return suffices
         (5, 3, 7, 1e8, 0, 5, 3),
     ]
 

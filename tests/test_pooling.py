@@ -1,3 +1,5 @@
+"""Pooling of runs: what is one group, what is a row, which baseline belongs to a variant."""
+
 import json
 
 import numpy as np
@@ -99,7 +101,7 @@ def test_incomplete_groups_have_notes(tmp_path):
         "only evaluations up to step 50 count, because not all seeds have later ones",
         "seeds from runs with different versions: jax 0.10.2, 0.11.0",
     )
-    assert (group.score.mean, group.scored_at) == (3.0, 50)  # of all three seeds, and of no step that one has not
+    assert (group.score.mean, group.scored_at) == (3.0, 50)  # of all three seeds, at a step that all have
     np.testing.assert_array_equal(group.finals, [1, 5, 3])
 
 

@@ -1,3 +1,5 @@
+"""Presets are valid for all algorithms and tasks."""
+
 import algorithm_rows
 import jax
 import pytest

@@ -1,3 +1,5 @@
+"""Time left, the live line, plain lines."""
+
 import io
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""The published numbers that are stored with the package."""
+
 import json
 import tomllib
 from pathlib import Path

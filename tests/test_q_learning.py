@@ -1,4 +1,4 @@
-"""One step of each rule by hand, what the rules have in common, and what they do on small MDPs."""
+"""One step of each rule by hand, what the rules have in common, and their results on small MDPs."""
 
 import functools
 from fractions import Fraction
@@ -224,7 +224,7 @@ def test_near_a_tie_the_ratio_is_unbounded():
         ]
         for greedy in ta.GREEDY
     }
-    # the std of the second action is sqrt(2): its penalty comes and goes with the choice
+    # the std of the second action is sqrt(2): its penalty depends on the choice
     assert ratios["min"] == pytest.approx([(2**0.5 / 2 - gap) / (2 * gap) for gap in (0.01, 0.001)], rel=1e-3)
     assert ratios["mean"][1] > 9 * ratios["mean"][0] > 300
     assert max(ratios["penalised"]) <= contraction.bound(0.5, 2, 1)

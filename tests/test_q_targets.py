@@ -1,4 +1,4 @@
-"""The conservative target: hand-worked numbers, the laws of the penalties, and what the target compiles to."""
+"""The conservative target: hand-worked numbers, the laws of the penalties, and its compiled program."""
 
 import re
 from functools import partial
@@ -247,19 +247,19 @@ def test_a_split_batch_has_the_complete_batchs_penalty(inside):
 
     halves = next_q.reshape(3, 2, 4).swapaxes(0, 1), reward.reshape(2, 4), discount.reshape(2, 4)
     split = jax.jit(jax.vmap(partial(ours, axis_name="devices"), axis_name="devices"))(*halves)
-    whole = ours(next_q, reward, discount)
-    np.testing.assert_allclose(split.reshape(8), whole, rtol=1e-6)
+    complete = ours(next_q, reward, discount)
+    np.testing.assert_allclose(split.reshape(8), complete, rtol=1e-6)
     alone = jax.jit(jax.vmap(ours))(*halves)  # without the mean over devices, each half has a penalty of its own
-    assert np.abs(alone.reshape(8) - whole).max() > 1e-3
+    assert np.abs(alone.reshape(8) - complete).max() > 1e-3
 
 
-# Refused
+# Rejected
 
 
 @pytest.mark.parametrize(
     "shapes",
     [
-        {"reward": (3, 1)},  # torch's habit: a target of [B, B]
+        {"reward": (3, 1)},  # would broadcast to a target of [B, B]
         {"discount": (3, 1)},
         {"next_q": (3,)},  # one critic: the minimum would be over the batch
         {"next_q": (2, 4)},
@@ -271,8 +271,8 @@ def test_a_split_batch_has_the_complete_batchs_penalty(inside):
 def test_shapes_that_would_broadcast_silently_are_rejected(maybe_jit, shapes):
     shapes = {"next_q": (2, 3), "reward": (3,), "discount": (3,), "entropy_term": (3,)} | shapes
     values = {name: jnp.ones(shape) for name, shape in shapes.items()}
-    refused = r"\[N, B\], \[B\] and \[B\], not|have to leave \(3,\) of the values, not \(3, 3\)"
-    with jax.numpy_rank_promotion("allow"), pytest.raises(ValueError, match=refused):  # as users have it
+    rejected = r"\[N, B\], \[B\] and \[B\], not|have to leave \(3,\) of the values, not \(3, 3\)"
+    with jax.numpy_rank_promotion("allow"), pytest.raises(ValueError, match=rejected):  # JAX's default
         maybe_jit(lambda values: q_targets.td_target(**values, gamma=0.9))(values)
 
 
@@ -287,13 +287,13 @@ def test_a_subset_of_too_many_critics_is_rejected(size):
 
 @pytest.mark.parametrize("penalty", [None, *PENALTIES], ids=lambda p: getattr(p, "__name__", "plain"))
 def test_the_target_compiles_to_a_few_fused_kernels_without_copies(penalty):
-    def whole(next_q, reward, discount, coef, gamma):
+    def complete(next_q, reward, discount, coef, gamma):
         bound = q_targets.no_penalty if penalty is None else partial(penalty, coef=coef)
         return target(next_q, reward, discount, gamma, penalty=bound)
 
     shapes = [(2, 256), (256,), (256,), (), ()]
     arguments = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    text = jax.jit(whole).lower(*arguments).compile().as_text()
+    text = jax.jit(complete).lower(*arguments).compile().as_text()
     entry = text[text.index("\nENTRY ") :]
     operations = re.findall(r"^\s+(?:ROOT )?%\S+ = \S+ ([\w-]+)\(", entry, flags=re.MULTILINE)
     kernels = [op for op in operations if op not in ("parameter", "constant", "bitcast", "tuple")]

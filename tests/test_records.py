@@ -1,3 +1,5 @@
+"""The tables, summary and events of a run."""
+
 import csv
 import json
 from types import SimpleNamespace
@@ -183,7 +185,7 @@ def test_events_for_tensorboard_are_written_per_member(tmp_path):
 
 def test_only_a_runs_own_files_are_removed(tmp_path):
     path = tmp_path / "run"
-    records.remove_run(path)  # nothing there
+    records.remove_run(path)  # does nothing
     (path / "policy").mkdir(parents=True)
     for name in ("config.json", "evaluations.csv", "policy/member_0.npz"):
         (path / name).write_text("x")

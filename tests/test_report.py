@@ -1,3 +1,5 @@
+"""The report command."""
+
 import re
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The report as a browser shows it: figures are to be seen, tables can be sorted, and nothing hostile runs."""
+"""The report as a browser shows it: figures are visible, tables can be sorted, and nothing hostile runs."""
 
 import browser
 import pytest
@@ -91,7 +91,7 @@ def test_a_click_sorts_ascending_then_descending_then_not(page):
     page.run(f"{HEADER}({place}).querySelector('button').click()")
     kind, up = state()
     assert kind == "ascending" and numbers(up) == sorted(numbers(before))
-    assert sorted(up) == sorted(before) and up[-1] == "-"  # none is lost, and what is empty stays below
+    assert sorted(up) == sorted(before) and up[-1] == "-"  # none is lost, and empty cells stay last
     page.run(f"{HEADER}({place}).querySelector('button').click()")
     kind, down = state()
     assert kind == "descending" and numbers(down) == numbers(up)[::-1] and down[-1] == "-"
@@ -127,7 +127,7 @@ def test_keys_reach_and_work_the_headers(page):
 
 def test_nothing_hostile_has_run(page):
     assert page.run("[document.scripts.length, document.images.length]") == [1, 0]
-    # Nor would it, were it markup: the page's policy forbids it.
+    # Even as markup it would not run: the page's policy forbids it.
     image = "<img src=x onerror='window.hacked = 1' style='color: red'>"
     page.run(f'document.body.insertAdjacentHTML("beforeend", "{image}")')
     page.run("document.body.append(Object.assign(document.createElement('script'), {textContent: 'hacked = 1'}))")

@@ -22,7 +22,7 @@ def test_default_name_has_the_changed_settings():
 
 
 def members_of(algo="sac_sqt", seeds=(3, 1), sweep=None, **settings):
-    """Members and the names of what is swept."""
+    """Members and the names of the swept settings."""
     sweep = sweep or {}
     small = {"hidden": (8, 4), "steps": 60, "warmup_steps": 20, "batch_size": 8}
     configs = [

@@ -1,3 +1,5 @@
+"""Details of a run for the report."""
+
 import json
 
 import pytest
@@ -11,7 +13,7 @@ NAN = float("nan")
 
 
 def details(path, **content):
-    """Of a run whose config.json also has `content`; None is taken out."""
+    """Details of a run whose config.json also has `content`; keys with None are removed."""
     file = path / "config.json"
     changed = json.loads(file.read_text()) | content
     file.write_text(json.dumps({name: value for name, value in changed.items() if value is not None}))

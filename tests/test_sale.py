@@ -95,7 +95,7 @@ def test_layers_start_within_one_over_the_root_of_the_fan_in_and_critics_apart(p
         assert len(np.unique(np.asarray(leaf).reshape(N, -1), axis=0)) == N
 
 
-# What they compute
+# Values
 
 
 def norm(x):

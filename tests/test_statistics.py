@@ -1,3 +1,5 @@
+"""Scores, IQM, improvements and bootstrap intervals, by hand and by their laws."""
+
 from pathlib import Path
 
 import numpy as np

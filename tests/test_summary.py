@@ -1,3 +1,5 @@
+"""The rows and the legend of the tabular study."""
+
 from pathlib import Path
 
 from made_curves import curves

@@ -1,3 +1,5 @@
+"""The tables command."""
+
 import csv
 import subprocess
 import sys

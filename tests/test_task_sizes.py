@@ -1,3 +1,5 @@
+"""Table 1, and the sizes of custom environments."""
+
 import json
 
 import pytest

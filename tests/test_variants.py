@@ -18,7 +18,7 @@ from sqt_jax.settings import Setting
 
 @pytest.fixture
 def td3_range(monkeypatch):
-    """A row as a user adds it: TD3 with a new penalty, under a name that says nothing about it."""
+    """A row as a user adds it: TD3 with a new penalty, under a name that does not mention it."""
     row = ALGORITHMS["td3_sqt"]
     check = Setting.check
     monkeypatch.setattr(Setting, "check", lambda self, value: value == "range" or check(self, value))
