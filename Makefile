@@ -9,7 +9,7 @@ STAMP := .venv/.installed
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-run: $(STAMP)  ## SAC with SQT on Ant, five seeds, on a small budget: about three minutes on two cores
+run: $(STAMP)  ## SAC with SQT on Ant, five seeds of 6,000 steps: about three minutes on two cores
 	$(BIN)/python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4 --preset=quick
 
 MINI := runs/miniature

@@ -1,7 +1,4 @@
-"""Plays the policy of a run: `python -m experiments.play RUN --video=film.mp4`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written); 130 interrupted.
-"""
+"""Plays the policy of a run: `python -m experiments.play RUN --video=film.mp4`."""
 
 import sys
 from collections.abc import Sequence

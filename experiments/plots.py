@@ -1,7 +1,4 @@
-"""Figures of finished runs: `python -m experiments.plots runs`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written).
-"""
+"""Figures of finished runs: `python -m experiments.plots runs`."""
 
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,4 @@
-"""A report on finished runs as one page: `python -m experiments.report runs`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written).
-"""
+"""A report on finished runs as one page: `python -m experiments.report runs`."""
 
 import shlex
 import sys

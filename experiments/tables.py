@@ -1,7 +1,4 @@
-"""The paper's tables of finished runs: `python -m experiments.tables runs`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written).
-"""
+"""The paper's tables of finished runs: `python -m experiments.tables runs`."""
 
 import sys
 from collections.abc import Sequence

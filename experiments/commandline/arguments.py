@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from experiments.running import files
 
-# Exit codes of all commands.
+# Exit codes of all commands; their meaning: experiments/README.md.
 DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 

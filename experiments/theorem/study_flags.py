@@ -84,13 +84,13 @@ def parse(argv: Sequence[str]) -> tuple[study.StudySettings, Path]:
     flag["coefs"] = coefs
     for name in ("gamma", "lr_power", "epsilon", "init_std", "weighted_c"):
         if not math.isfinite(flag[name]):
-            raise UsageError(f"--{name}: expects a number, got {flag[name]}")
+            raise UsageError(f"--{name}: expects a number, not {flag[name]}")
     if not 0 < flag["gamma"] < 1:  # the ratios of eq. 16 are divided by it
-        raise UsageError(f"--gamma: expects a number above 0 and below 1, got {flag['gamma']:g}")
+        raise UsageError(f"--gamma: expects a number above 0 and below 1, not {flag['gamma']:g}")
     if flag["lr_power"] <= 0.5:
-        raise UsageError(f"--lr_power: expects a number above 0.5 and up to 1, got {flag['lr_power']:g}")
+        raise UsageError(f"--lr_power: expects a number above 0.5 and up to 1, not {flag['lr_power']:g}")
     if flag["weighted_c"] == 0:
-        raise UsageError("--weighted_c: expects a number above 0, got 0")
+        raise UsageError("--weighted_c: expects a number above 0, not 0")
     out = flag.pop("out")
     _check_out(out, flag.pop("overwrite"))
     settings = {name: flag[name] for name in (field.name for field in dataclasses.fields(study.StudySettings))}
@@ -113,7 +113,7 @@ def _coefficient(word: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 <= value < math.inf:
-        raise UsageError(f"--coefs: expects numbers of at least 0 like 0,0.5, got {word!r}")
+        raise UsageError(f"--coefs: expects numbers of at least 0 like 0,0.5, not {word!r}")
     return value
 
 
