@@ -39,15 +39,17 @@ class Layout(NamedTuple):
 
     @property
     def spread(self) -> bool:
+        """Whether there are several devices."""
         return len(self.devices) > 1
 
     @property
-    def held(self) -> int:
-        """S and the padding of the last device's share."""
+    def padded_size(self) -> int:
+        """S plus the padding that makes the devices' shares equal."""
         return len(self.devices) * math.ceil(self.members / len(self.devices)) if self.spread else self.members
 
     @property
     def mesh(self) -> Mesh:
+        """The devices as a mesh of one axis."""
         return Mesh(np.asarray(self.devices), (AXIS,))
 
     def specs(self, axes: Any) -> Any:
@@ -68,9 +70,9 @@ class Layout(NamedTuple):
         # Every device computes the leaves that members share in the same way; the check cannot see that.
         return jax.shard_map(mapped, mesh=self.mesh, **specs, check_vma=False)
 
-    def filled(self, leaf: Any) -> Any:
-        """[S, ...] -> [held, ...]"""
-        return leaf if self.held == self.members else leaf[np.arange(self.held) % self.members]
+    def padded(self, leaf: Any) -> Any:
+        """[S, ...] -> [padded_size, ...], with copies of the first members"""
+        return leaf if self.padded_size == self.members else leaf[np.arange(self.padded_size) % self.members]
 
 
 def usable_devices(members: int) -> int:

@@ -28,10 +28,12 @@ class Means(NamedTuple):
 
     @classmethod
     def start(cls, like: Metrics) -> "Means":
+        """Means of no values, for metrics of these names and shapes."""
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), like)
         return cls(zeros, zeros)
 
     def add(self, metrics: Metrics) -> "Means":
+        """The means with one more value of each metric."""
         count = jax.tree.map(lambda n, x: n + ~jnp.isnan(x), self.measured, metrics)
         # The running mean stays near the values: a long interval does not lose digits, as a sum would.
         mean = jax.tree.map(
@@ -40,6 +42,7 @@ class Means(NamedTuple):
         return Means(mean, count)
 
     def result(self) -> Metrics:
+        """The means; NaN where nothing was measured."""
         return jax.tree.map(lambda m, n: jnp.where(n > 0, m, jnp.nan), self.mean, self.measured)
 
 
@@ -233,7 +236,7 @@ def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
     layout = layout or Layout(1)
 
     def init(keys: Array, scalars: Scalars) -> TrainState:
-        return on_devices(*jax.tree.map(layout.filled, (keys, scalars)))
+        return on_devices(*jax.tree.map(layout.padded, (keys, scalars)))
 
     on_devices = layout.over_members(trainer.init, (0, 0), axes)
     return Sweep(

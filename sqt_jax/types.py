@@ -81,10 +81,13 @@ class Scalars(NamedTuple):
     temperature: Array | float  # SAC's; its start where it is learned
 
     def as_arrays(self) -> "Scalars":
+        """The same values as float32 arrays []."""
         return Scalars(*(jnp.asarray(value, jnp.float32) for value in self))
 
 
 class Init(Protocol):
+    """`Agent.init`."""
+
     def __call__(self, key: Array, scalars: Scalars | None = None) -> State:
         """A new agent.
 
@@ -94,11 +97,15 @@ class Init(Protocol):
 
 
 class Act(Protocol):
+    """`Agent.act`."""
+
     def __call__(self, state: State, obs: Array, key: Array, deterministic: bool = False) -> Array:
         """Actions [B, A] in [-1, 1] for obs [B, O]: exploring ones, or those of the policy that is evaluated."""
 
 
 class Update(Protocol):
+    """`Agent.update`."""
+
     def __call__(self, state: State, batch: Transition, key: Array, step: Array) -> tuple[State, Array, Metrics]:
         """One update of all networks that are due.
 
@@ -115,6 +122,8 @@ class Update(Protocol):
 
 
 class Observe(Protocol):
+    """`Agent.observe`."""
+
     def __call__(self, state: State, episode_return: Array, ended: Array, step: Array) -> State:
         """Reports the progress of the agent's episodes; called after each environment step.
 

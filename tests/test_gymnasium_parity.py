@@ -88,7 +88,7 @@ def test_time_limit_and_spaces(name):
 
 
 def velocities(name: str) -> slice:
-    positions = recorded(name).qpos.shape[1] - TASKS[name].hidden
+    positions = recorded(name).qpos.shape[1] - TASKS[name].unobserved
     return slice(positions, positions + recorded(name).qvel.shape[1])
 
 

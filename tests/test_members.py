@@ -22,13 +22,13 @@ two_devices = pytest.mark.skipif(len(DEVICES) < 2, reason="one device only")
 
 
 @pytest.mark.parametrize(
-    ("count", "devices", "held"), [(1, 0, 1), (5, 1, 5), (4, 2, 4), (5, 2, 6), (3, 8, 8), (9, 4, 12)]
+    ("count", "devices", "size"), [(1, 0, 1), (5, 1, 5), (4, 2, 4), (5, 2, 6), (3, 8, 8), (9, 4, 12)]
 )
-def test_shares_are_equal(count, devices, held):
+def test_shares_are_equal(count, devices, size):
     layout = Layout(count, (jax.devices()[0],) * devices)
-    assert layout.held == held
-    filled = layout.filled(np.arange(count))
-    assert list(filled) == [index % count for index in range(held)]
+    assert layout.padded_size == size
+    padded = layout.padded(np.arange(count))
+    assert list(padded) == [index % count for index in range(size)]
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_shares_are_equal(count, devices, held):
 def test_a_sweep_uses_the_devices_that_get_members(monkeypatch, here, count, used):
     monkeypatch.setattr(jax, "local_devices", lambda: list(range(here)))
     assert members.usable_devices(count) == used
-    assert Layout(count, (jax.devices()[0],) * used).held - count < math.ceil(count / used)
+    assert Layout(count, (jax.devices()[0],) * used).padded_size - count < math.ceil(count / used)
 
 
 def trained(sweep, config, count):

@@ -163,7 +163,7 @@ def test_every_device_has_a_member(tmp_path, monkeypatch):
     monkeypatch.setattr(jax, "local_devices", lambda: jax.devices() * 4)
     with pytest.raises(flags.UsageError, match=r"^--devices=3: expects at most one for each of 2 members$"):
         plan(tmp_path, "--seeds=0,1", "--devices=3", "--name=a")
-    assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4
+    assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.padded_size == 4
 
 
 def test_default_devices_are_chosen_again_when_a_run_resumes(tmp_path, monkeypatch):

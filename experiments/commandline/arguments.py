@@ -57,6 +57,7 @@ class Parser(argparse.ArgumentParser):
         return options
 
     def error(self, message: str) -> NoReturn:
+        """Raises `UsageError` with argparse's message in this repository's form."""
         flag, _, rest = message.removeprefix("argument ").partition(": ")
         if "expected one argument" in rest:
             rest = _expectation(next(action for action in self._actions if flag in action.option_strings))

@@ -33,6 +33,8 @@ class OutputConfig:
 
 
 class Flag(NamedTuple):
+    """One flag: how its text is parsed, and its line in --help."""
+
     name: str
     parse: Callable[[str], Any] | None  # None: a switch
     expects: str

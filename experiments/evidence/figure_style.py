@@ -104,15 +104,18 @@ class Stars:
         self.labels: set[str] = set()
 
     def add(self, label: str, where: str, notes: Sequence[str]) -> None:
+        """Adds the notes of a row, each once; `where` names the cell."""
         for note in notes:
             self.labels.add(label)
             if f"* {where}: {note}" not in self.texts:
                 self.texts.append(f"* {where}: {note}")
 
     def starred(self, label: str) -> str:
+        """The row's label, with a star if it has notes."""
         return f"{label} *" if label in self.labels else label
 
     def lines(self, width: int, most: int = 8) -> list[str]:
+        """The first `most` notes, wrapped to `width` characters."""
         shown = [line for text in self.texts[:most] for line in textwrap.wrap(text, width)]
         return shown + ([f"... and {len(self.texts) - most} more"] if len(self.texts) > most else [])
 

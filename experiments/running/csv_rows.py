@@ -73,6 +73,7 @@ class CsvTable:
         return self._size
 
     def close(self) -> None:
+        """Closes the file. Waiting rows are lost."""
         os.close(self._file)
 
     def _line(self, row: Mapping[str, Any]) -> bytes:

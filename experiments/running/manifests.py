@@ -39,6 +39,7 @@ class Step(NamedTuple):
 
     @property
     def name(self) -> str:
+        """Of the checkpoint's folder."""
         return f"step_{self.env_steps:010}" + (f".{self.repeat}" if self.repeat else "")
 
 
@@ -51,6 +52,7 @@ class Rows(NamedTuple):
 
     @property
     def name(self) -> str:
+        """Of the file."""
         return f"rows_{self.start:010}_{self.stop:010}.bin"
 
 

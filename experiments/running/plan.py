@@ -43,6 +43,7 @@ class Plan(NamedTuple):
 
     @property
     def train(self) -> TrainConfig:
+        """Of all members."""
         return self.config.train
 
 
@@ -84,7 +85,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         raise UsageError(f"--physics: {error}") from None
     output = _output(options, target.resumed, config.train)
     layout = _layout(count, output["devices"], typed=options.devices is not None)
-    needed, free = memory_estimate(config, layout.held, used_env), _free_memory(len(layout.devices))
+    needed, free = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
     if needed > free:
         raise UsageError(
             f"--replay_capacity={config.train.replay_capacity}: {count} members need about "

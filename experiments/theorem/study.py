@@ -44,6 +44,7 @@ class StudySettings:
     weighted_c: float
 
     def algorithms(self) -> dict[str, q_learning.TabularAlgorithm]:
+        """The algorithms by name, with these settings."""
         return q_learning.algorithms(self.tables, self.ddof, self.greedy, self.weighted_c)
 
 
