@@ -27,7 +27,7 @@ def parser() -> Parser:
         type=one_of(*NAMES),
         default="terminal",
         metavar="NAME",
-        help=f"of what is printed: {', '.join(NAMES)} (terminal)",
+        help=f"format of the printed tables: {', '.join(NAMES)} (terminal)",
     )
     made.add_argument("--out", type=folder, metavar="FOLDER", help="also write the tables there, in all formats")
     made.add_argument("--overwrite", action="store_true", help="replace existing tables")

@@ -41,7 +41,7 @@ class Setting(NamedTuple):
     features: tuple[str, ...] = ()  # it has an effect only with all of these (`config.FEATURES`)
     flag: str | None = None  # the flag that sets it; None: the algorithm's name does
     auto: str | None = None  # the switch that the word `auto` turns on instead
-    default_text: str = ""  # what `--help` shows if the default depends on other things
+    default_text: str = ""  # the text of `--help` if the default depends on other things
 
     def expects(self) -> str:
         """The values that it may have, in words: `a whole number of at least 1`."""

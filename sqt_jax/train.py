@@ -83,7 +83,7 @@ class Sweep(NamedTuple):
 
 
 def new_interval(state: TrainState) -> TrainState:
-    """Resets what `measure` averages."""
+    """The state with the averages of `measure` reset."""
     means = jax.tree.map(jnp.zeros_like, state.means)
     return state._replace(episodes=state.episodes.forget_ended(), means=means)
 

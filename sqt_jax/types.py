@@ -33,7 +33,7 @@ class Transition(NamedTuple):
 
 
 class TimeStep(NamedTuple):
-    """What an environment returns from `reset` and `step`.
+    """The result of an environment's `reset` and `step`.
 
     When an episode ends (`terminated` or `truncated`), `obs` is already the first observation of the next episode,
     `final_obs` the last one of the episode that ended. Elsewhere `final_obs` equals `obs`.
@@ -59,7 +59,7 @@ class Environment(NamedTuple):
     episode_length: int  # steps until truncation
     reset: Callable[[Array], TimeStep]  # key -> first time step
     step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
-    set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
+    set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step in that state
     status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts to report, summed over environments
     # A lower bound on the mean episode length. 1 is always safe; a larger one saves memory in the replay (`Ring`).
     min_mean_episode_length: int = 1
@@ -199,5 +199,5 @@ class Replay(NamedTuple):
     rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows for a checkpoint [count, floats]
     with_rows: Callable[[State, Array, Array | int], State]  # (state, saved rows, first) -> state with them
     without_rows: Callable[[State], State]  # state -> the same with None in place of the arrays that `rows` covers
-    # A prefix tree of the state for `vmap`: 0, or None for what the members of a sweep share (they insert in lockstep).
+    # A prefix tree of the state for `vmap`: 0, or None for leaves that members share (they insert in lockstep).
     member_axes: Any = 0

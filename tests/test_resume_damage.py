@@ -144,7 +144,7 @@ def outside(path):
 
 
 def goes_on(finished, path, capsys, said):
-    """Resumes; what is said of the checkpoints is `said`, a pattern per line."""
+    """Resumes; the messages about checkpoints match `said`, a pattern per line."""
     before = outside(path)
     assert run(f"--resume={path}", "--quiet") == 0
     out, err = capsys.readouterr()

@@ -67,7 +67,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _expectation(action: argparse.Action) -> str:
-    """What a flag expects, taken from the message of its type for an empty text."""
+    """The words of a flag's type about the expected value, from its message for an empty text."""
     try:
         if callable(action.type):
             action.type("")

@@ -16,7 +16,7 @@ class PresetRow(NamedTuple):
     env: str = "*"
 
 
-# What the authors' released code trains under the names of TD3 and SAC: TD7's update around their actions, with an
+# The authors' released code trains TD7's update with TD3's or SAC's actions, under the names of TD3 and SAC, with an
 # encoder that is never trained.
 UNTRAINED_SALE = {"networks": "sale", "train_encoder": False, "value_clipping": False}
 

@@ -57,7 +57,7 @@ class Style(NamedTuple):
 class Panel(NamedTuple):
     """One pair of axes: some rows on one task."""
 
-    part: int  # a figure's parts are a baseline and its SQT variants each, or all rows; each part has one legend
+    part: int  # a part is a baseline with its SQT variants, or all rows; it has one legend
     rows: tuple[AlgorithmRow, ...]
     task: str
     axes: Axes
@@ -164,7 +164,7 @@ def add_texts(
         kind: dict[str, Any] = {"handles": handles, "frameon": False, "fontsize": "small", "handlelength": 3}
         if len(last) == 1:
             figure.legend(loc="outside right center", **kind)
-        elif len(last) == len(panels):  # one task: the parts are side by side
+        elif len(last) == len(panels):  # one task: a row of panels, one per part
             panel.axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), **kind)
         else:
             panel.axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), **kind)

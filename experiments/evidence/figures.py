@@ -188,7 +188,7 @@ def file_contents(draw: Mapping[str, Callable[[], Figure | None]], kind: str) ->
 
 
 def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
-    """Draws with texts as they are: a dollar sign in a run's files starts no formula."""
+    """Draws without formulas: a dollar sign in a run's files is shown as it is."""
     with matplotlib.rc_context({"text.parse_math": False}):
         return draw()
 

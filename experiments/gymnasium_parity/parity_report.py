@@ -83,7 +83,7 @@ def report(
       speeds: env steps per second of all members together, by task and case.
       states: as in `Counts`.
       members: number of environments in parallel in `speeds`.
-      machine: what the speeds depend on, by name.
+      machine: its properties by name (`benchmarks.machine`), on which the speeds depend.
       command: the command line that made the report.
     """
     about = ", ".join(f"{key}: {value}" for key, value in machine.items())

@@ -13,12 +13,12 @@ from sqt_jax.types import Environment, TimeStep
 
 
 class PlayedTask(NamedTuple):
-    """An environment to play in, and what its film needs."""
+    """An environment to play in, and the parts that its film needs."""
 
     env: Environment
     physics: str
     period: float  # seconds per control step
-    look: Callable[[TimeStep], Any]  # what is kept of a state, as in `episodes.play`
+    look: Callable[[TimeStep], Any]  # the part of a state to keep, as in `episodes.play`
     scene: Any  # a mujoco.MjModel; for brax:ENV Brax's own environment
 
 

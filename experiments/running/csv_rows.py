@@ -21,7 +21,7 @@ class CsvTable:
     """Rows are in the file when `write` returns. If the disk is full they wait in memory for the next `write`.
 
     Args:
-      keep: bytes of an existing file to keep; what follows is cut off. 0: a new table.
+      keep: bytes of an existing file to keep; the rest is cut off. 0: a new table.
       columns: their names.
 
     Raises:

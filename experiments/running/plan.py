@@ -1,4 +1,4 @@
-"""From a command line to a plan: what is trained and where, checked before anything is written or compiled."""
+"""From a command line to a plan (settings, folder, devices), checked before anything is written or compiled."""
 
 import dataclasses
 import re

@@ -25,7 +25,7 @@ SUPPORTED, CONTRADICTED, NOT_SHOWN = "supported", "contradicted", "not shown"
 
 
 class Statement(NamedTuple):
-    """A claim of the paper and what the study shows about it."""
+    """A claim of the paper, and the study's verdict on it."""
 
     claim: str
     verdict: str  # supported, contradicted, not shown, or in how many rows it holds
@@ -43,7 +43,7 @@ def verdict_of(intervals: Sequence[tuple[float, float]], sign: int, unit: str = 
     `supported` where it holds in all, `contradicted` where all have the other sign, `not shown` where none has a sign.
 
     Args:
-      unit: of what there is one interval each.
+      unit: the things that have an interval each, in the plural.
     """
     sides = [side_of(*row, sign) for row in intervals]
     for side, verdict in ((1, SUPPORTED), (-1, CONTRADICTED), (0, NOT_SHOWN)):

@@ -76,7 +76,7 @@ def make_environment(
     an episode whose numbers are no longer finite. After each end it calls `start` again (the auto-reset): the time step
     then has the state and `obs` of the new episode, and the old one's last observation as `final_obs`.
 
-    What they must not do: have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
+    They must not have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
     key in the state and split it), branch in Python on a traced value, count the time limit, or start a new episode
     themselves. The state is any tree of arrays; it must have the same structure, shapes and dtypes from both functions.
 
@@ -95,7 +95,7 @@ def make_environment(
       speed: `state -> []`, the forward speed in m/s of the step that led to the state, shown in evaluations.
 
     Returns:
-      The environment; what it promises is at the top of this module. It can be used in `sqt_jax.make_train(config,
+      The environment, with the contract at the top of this module. It can be used in `sqt_jax.make_train(config,
       env=env)`.
     """
 

@@ -33,7 +33,7 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
     """MuJoCo's C library.
 
     Args:
-      setup: the model and what the task needs.
+      setup: the model, and the quantities that the task needs.
       num_threads: threads that step the robots of a call; None: one for each usable core.
 
     Raises:
