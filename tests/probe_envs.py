@@ -24,7 +24,7 @@ def one_step() -> Environment:
     return make_environment("one_step", 1, 1, 10, start, advance)
 
 
-def shorter_than_it_says() -> Environment:
+def shorter_than_stated() -> Environment:
     """`one_step`, whose replay has room for the final observations of longer episodes."""
     return one_step()._replace(min_mean_episode_length=8)
 

@@ -304,7 +304,7 @@ def test_several_environments_per_member_fill_the_ring_interleaved(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["td3", "td7"])
 def test_transitions_that_lost_their_final_observations_stay_lost(algo, tmp_path):
-    case = Case(algo, make_env=probe_envs.shorter_than_it_says)
+    case = Case(algo, make_env=probe_envs.shorter_than_stated)
     state = case.saved(case.store(tmp_path), 50, 130)
     assert np.all(case.replay.size(state.replay) == 1 + 64 / 8 + 1)  # the newest one's needs no room
     restored = case.store(tmp_path).restore(case.template)

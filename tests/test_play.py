@@ -93,7 +93,7 @@ def test_a_member_is_named_and_steps_are_limited(folder, capsys):
     assert play.main(["play", RUN, "--seed=3", "--steps=4"]) == 0
     out = capsys.readouterr().out
     assert "member 0, seed 3 (of 2)" in out and "4 steps, 0.0 s, cut off" in out
-    assert out.endswith("no display here: --video=FILE films it\n")
+    assert out.endswith("no display here: --video=FILE writes a film\n")
 
 
 def test_where_there_is_a_display_mujocos_viewer_shows_it(folder, capsys, monkeypatch):

@@ -48,9 +48,9 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     if options.video:
         film_episodes(task, played, options, caption, console)
     elif is_brax(task.env.name):
-        print("--video=FILE.html films it")
+        print("--video=FILE.html writes a film")
     elif not (graphics.has_display() and graphics.works("glfw")):
-        print("no display here: --video=FILE films it")
+        print("no display here: --video=FILE writes a film")
     else:
         show_episodes(task, played, options.camera)
 
@@ -108,7 +108,7 @@ def show_episodes(task: PlayedTask, played: Sequence[PlayedEpisode], camera: str
     try:
         viewer.show(task.scene, [episode.shown for episode in played], task.period, camera)
     except RuntimeError as error:
-        raise UsageError(f"RUN: cannot be shown in MuJoCo's viewer ({error}); --video=FILE films it") from None
+        raise UsageError(f"RUN: cannot be shown in MuJoCo's viewer ({error}); --video=FILE writes a film") from None
 
 
 def counted(pictures: Iterable[np.ndarray], done: Callable[[int], None]) -> Iterator[np.ndarray]:

@@ -12,7 +12,7 @@ from experiments.running import files
 
 EXAMPLE = "python -m experiments.play RUN --video=film.mp4"
 DESCRIPTION = """\
-Plays a policy that a run has learned: prints the return of each episode, and films the same episodes in real time.
+Plays the policy of a run: prints the return of each episode, and films the same episodes in real time.
 Without --video they are shown in MuJoCo's viewer if there is a display. Of a run's members, the best at the last
 evaluation is played, unless --seed or --member names another. Without a display, MUJOCO_GL selects OpenGL's
 implementation; by default EGL or OSMesa, whichever works."""
