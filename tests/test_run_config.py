@@ -64,7 +64,7 @@ def test_seeds_vary_fastest():
 
 def test_settings_of_a_run_have_the_swept_values_as_tuples():
     members, swept = members_of(seeds=(3, 1), sweep={"lr": (0.1, 0.2), "tau": (0.5, 0.25)})
-    settings = run_config.settings_of(members, swept)
+    settings = run_config.all_settings(members, swept)
     assert (settings["seeds"], settings["lr"], settings["tau"]) == ((3, 1), (0.1, 0.2), (0.5, 0.25))
     assert settings.keys() == members[0].config.flat().keys() | {"seeds"}
     assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)

@@ -12,7 +12,7 @@ from experiments.commandline.arguments import UsageError
 from experiments.playing import brax_pages, episodes, films, graphics, policies, rendering, viewer
 from experiments.playing.episodes import PlayedEpisode
 from experiments.playing.play_flags import is_brax
-from experiments.playing.played_task import PlayedTask, make_task
+from experiments.playing.played_task import PlayedTask, make_played_task
 from experiments.running import files, progress, runtime
 from sqt_jax.rollout import Policy
 
@@ -35,7 +35,7 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     described = policies.read(run)
     returns = policies.final_returns(run, len(described.members))
     chosen = policies.choose(described, returns, options.seed, options.member)
-    task = make_task(chosen.member.config, options.physics, options.camera)
+    task = make_played_task(chosen.member.config, options.physics, options.camera)
     policy = policies.load(run, chosen, task.env)
     caption = policies.caption(described, chosen)
     print(caption)

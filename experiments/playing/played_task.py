@@ -22,7 +22,7 @@ class PlayedTask(NamedTuple):
     scene: Any  # a mujoco.MjModel; for brax:ENV Brax's own environment
 
 
-def make_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
+def make_played_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
     """The environment that a member was trained on.
 
     Args:

@@ -149,7 +149,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
         return _Target(members=members, swept=swept, path=path, resumed=None)
-    wanted = run_config.settings_of(members, swept) | run_config.sizes_of(env)
+    wanted = run_config.all_settings(members, swept) | run_config.sizes_of(env)
     if options.name is None:
         path, run = resume.latest(folder, wanted)
     elif not _exists(path / run_config.NAME):

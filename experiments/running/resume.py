@@ -111,7 +111,7 @@ def changed_versions(run: RunConfig) -> list[str]:
 
 def _problem(run: RunConfig, wanted: Mapping[str, Any]) -> str | None:
     """Why the run cannot be resumed with the settings `wanted`."""
-    own = run.content.get("own_env", {}) | run_config.settings_of(run.members, run.swept)
+    own = run.content.get("own_env", {}) | run_config.all_settings(run.members, run.swept)
     differing = [
         f"{name} (its own: {_text(own.get(name))}, now: {_text(value)})"
         for name, value in wanted.items()

@@ -60,7 +60,7 @@ def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member
     return [Member(seed, config) for config, seed in product(configs, seeds)]
 
 
-def settings_of(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
+def all_settings(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
     """All settings of a run by name; swept settings and `seeds` as tuples of their values."""
     settings = members[0].config.flat() | {"seeds": _values(member.seed for member in members)}
     return settings | {name: _values(getattr(m.config.agent, name) for m in members) for name in swept}
