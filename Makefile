@@ -1,4 +1,4 @@
-# Every target makes .venv itself where it is missing or older than the two files that say what belongs in it.
+# Every target creates .venv if it is missing or older than pyproject.toml or constraints.txt.
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -9,7 +9,7 @@ STAMP := .venv/.installed
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-run: $(STAMP)  ## SAC with SQT on Ant, five seeds, on a small budget: about three minutes on two cores
+run: $(STAMP)  ## SAC with SQT on Ant, five seeds of 6,000 steps: about three minutes on two cores
 	$(BIN)/python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4 --preset=quick
 
 MINI := runs/miniature
@@ -21,7 +21,7 @@ miniature: $(STAMP)  ## the paper's tables 2 to 4 in small: nine algorithms, two
 	$(BIN)/python -m experiments.report $(MINI) --reference --out=$(MINI)/report.html --overwrite
 	$(BIN)/python -m experiments.play $(MINI)/cheetah/td7_sqt/*/ --video=$(MINI)/td7_sqt.mp4 --overwrite
 
-test: $(STAMP)  ## all tests but the slow ones
+test: $(STAMP)  ## all tests except the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-all: $(STAMP)  ## all tests, compiled as users' programs are

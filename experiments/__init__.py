@@ -1,1 +1,1 @@
-"""The command line: runs, their records and pictures. Uses `sqt_jax`; nothing imports it."""
+"""The commands (`python -m experiments.COMMAND`) and the packages behind them; the guide is README.md."""

@@ -1,6 +1,6 @@
-"""Does a run survive being killed? `python -m experiments.killtest --kills=50`.
+"""Kills trainings, resumes them and compares the results: `python -m experiments.killtest --kills=50`.
 
-Trains once without a break. Then kills trainings (SIGKILL) at random moments and in the middle of writing files,
+Trains without a break first. Then kills trainings (SIGKILL) at random moments and in the middle of writing files,
 resumes them with --resume, and compares the results: every array of the training state bit for bit, the replay rows,
 and the rows of both tables except their times. One training in five is killed twice.
 """

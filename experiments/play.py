@@ -1,17 +1,12 @@
-"""Plays a learned policy: `python -m experiments.play RUN --video=film.mp4`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written); 130 interrupted.
-"""
+"""Plays the policy of a run: `python -m experiments.play RUN --video=film.mp4`."""
 
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.commandline.arguments import guarded
+from experiments.commandline.arguments import INTERRUPTED, guarded
 from experiments.playing import play_flags
 from experiments.playing.play_flags import parser
-
-INTERRUPTED = 130
 
 
 def command(argv: Sequence[str]) -> None:

@@ -1,7 +1,4 @@
-"""Figures of finished runs: `python -m experiments.plots runs`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written).
-"""
+"""Figures of finished runs: `python -m experiments.plots runs`."""
 
 import sys
 from collections.abc import Sequence
@@ -40,7 +37,7 @@ def parser() -> Parser:
 
 
 def command(argv: Sequence[str]) -> None:
-    """Raises `UsageError`."""
+    """Writes the figures. Raises `UsageError`."""
     options = parser().read(argv)
     from experiments.evidence import figures, pooling  # imports JAX and matplotlib
 
@@ -56,7 +53,7 @@ def command(argv: Sequence[str]) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line `argv`, program name first; returns the exit code."""
+    """Runs the command line `argv`, program name first; returns the exit code."""
     return guarded(command, argv)
 
 

@@ -1,7 +1,4 @@
-"""A report on finished runs as one page: `python -m experiments.report runs`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written).
-"""
+"""A report on finished runs as one page: `python -m experiments.report runs`."""
 
 import shlex
 import sys
@@ -36,7 +33,7 @@ def parser() -> Parser:
 
 
 def command(argv: Sequence[str]) -> None:
-    """Raises `UsageError`."""
+    """Writes the report. Raises `UsageError`."""
     options = parser().read(argv)
     arguments.reject_file("--out", options.out, options.overwrite)
     from experiments.evidence import page, pooling  # imports JAX and matplotlib
@@ -51,7 +48,7 @@ def command(argv: Sequence[str]) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line `argv`, program name first; returns the exit code."""
+    """Runs the command line `argv`, program name first; returns the exit code."""
     return guarded(command, argv)
 
 

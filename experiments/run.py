@@ -1,8 +1,4 @@
-"""Train one sweep and record it: `python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4`.
-
-Exit codes: 0 done; 1 the results could not be written; 2 bad usage (one line, nothing written); 3 a member diverged;
-130 interrupted.
-"""
+"""Train one sweep and record it: `python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4`."""
 
 import sys
 from collections.abc import Sequence

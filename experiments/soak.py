@@ -20,6 +20,7 @@ flags.DEFINE_integer("rounds", 5, "How often each task is stepped.", lower_bound
 
 
 def main(argv: Sequence[str]) -> None:
+    """Runs the test; exits with 1 and a line if it fails."""
     del argv
     logging.set_verbosity(logging.WARNING)
     runtime.prepare()

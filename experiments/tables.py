@@ -1,7 +1,4 @@
-"""The paper's tables of finished runs: `python -m experiments.tables runs`.
-
-Exit codes: 0 done; 2 bad usage (one line, nothing written).
-"""
+"""The paper's tables of finished runs: `python -m experiments.tables runs`."""
 
 import sys
 from collections.abc import Sequence
@@ -14,11 +11,11 @@ DESCRIPTION = """\
 The paper's tables of finished runs: 1, sizes of the tasks; 2, scores; 3, disagreement of the critics and bias; 4, SQT
 against SQT-tuple. Tables 2 and 3 also compare each SQT variant with its baseline.
 
-- Seeds are pooled where the algorithm, the task and all settings are equal; else they are rows of their own.
+- Seeds are pooled where the algorithm, the task and all settings are equal; otherwise they are separate rows.
 - An SQT variant is compared with a run of its baseline that differs from it in the penalty's settings only.
 - Footnotes mark incomplete cells (fewer seeds than others, stopped early, diverged) and say why; an empty cell stays
   empty. A cell uses only the evaluations that all its seeds have.
-- With five seeds the intervals that are called 95 % are too narrow: they cover about 85 % (mean) or 90 % (IQM)."""
+- With five seeds the nominal 95 % intervals cover only about 85 % (mean) or 90 % (IQM)."""
 NAMES = ("terminal", "markdown", "csv", "latex")
 
 
@@ -30,7 +27,7 @@ def parser() -> Parser:
         type=one_of(*NAMES),
         default="terminal",
         metavar="NAME",
-        help=f"of what is printed: {', '.join(NAMES)} (terminal)",
+        help=f"format of the printed tables: {', '.join(NAMES)} (terminal)",
     )
     made.add_argument("--out", type=folder, metavar="FOLDER", help="also write the tables there, in all formats")
     made.add_argument("--overwrite", action="store_true", help="replace existing tables")
@@ -39,7 +36,7 @@ def parser() -> Parser:
 
 
 def command(argv: Sequence[str]) -> None:
-    """Raises `UsageError`."""
+    """Prints the tables, and writes them if --out is given. Raises `UsageError`."""
     options = parser().read(argv)
     from experiments.evidence import formats, paper_tables, pooling, task_sizes  # imports JAX
 
@@ -55,7 +52,7 @@ def command(argv: Sequence[str]) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line `argv`, program name first; returns the exit code."""
+    """Runs the command line `argv`, program name first; returns the exit code."""
     return guarded(command, argv)
 
 

@@ -11,14 +11,12 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from experiments.commandline.arguments import UsageError, printable
+from experiments.commandline.arguments import BAD_USAGE, DONE, INTERRUPTED, UsageError, printable
 from experiments.theorem import study, study_flags
-
-DONE, BAD_USAGE, INTERRUPTED = 0, 2, 130
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line `argv`, program name first; returns the exit code."""
+    """Runs the command line `argv`, program name first; returns the exit code."""
     if any(word in ("--help", "-help", "-h") for word in argv[1:]):
         print(__doc__ + "\n" + study_flags.define_flags().get_help())
         return DONE

@@ -1,4 +1,4 @@
-"""SQT, a conservative target for ensemble actor-critics, on TD3, SAC and TD7, as pure JAX functions."""
+"""SQT, a conservative target for ensemble actor-critics, on TD3, SAC and TD7: pure JAX functions (guide: README.md)."""
 
 from sqt_jax import q_targets
 from sqt_jax.algorithms import ALGORITHMS, make_agent, make_config, make_train, make_trainer

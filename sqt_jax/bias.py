@@ -1,4 +1,4 @@
-"""The bias of critics: Q(s, a) at the states of an episode minus the discounted return from there.
+"""The bias of critics: Q(s, a) at the states of an episode minus the discounted return from them.
 
 For SAC the return includes the entropy bonuses of the later actions. Of an episode that the time limit truncates, the
 rest of the return is unknown: only states far enough from the limit count, those from which gamma^(steps to the limit)
@@ -18,7 +18,7 @@ NAMES = ("value_bias", "value_bias_min", "value_bias_normalised")
 class Sums(NamedTuple):
     """Sums over some of an episode's states, for E episodes: [E] each."""
 
-    weight: Array  # of gamma^(steps since the state): what the next reward adds to `returns`
+    weight: Array  # of gamma^(steps since the state): the factor of the next reward in `returns`
     returns: Array  # of the discounted return from the state, up to the current step
     q_mean: Array  # of the mean over the critics at the state
     q_min: Array  # of the minimum over the critics at the state

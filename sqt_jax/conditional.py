@@ -1,9 +1,4 @@
-"""A conditional that is still one under `vmap`.
-
-Under `vmap`, `jax.lax.cond` on a batched predicate becomes a `select` and runs both branches for all. `cond_if_any`
-runs its branch only if the predicate holds for at least one batch entry; if it holds for none, nothing is computed or
-copied.
-"""
+"""`cond_if_any`, a conditional that does not compute its branch under `vmap` if no batch entry needs it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,8 +16,8 @@ def cond_if_any(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) 
     """`branch(old, given)` if `predicate` holds, else `old`; under `vmap` the branch runs only if any entry needs it.
 
     Under `vmap`, `lax.cond` on a batched predicate becomes a select and runs both branches for all; this runs the
-    branch only if the predicate holds for at least one batch entry. Entries for which it does not hold keep `old`. Use
-    it for updates that are rare and expensive, like the start of a new episode.
+    branch only if the predicate holds for at least one batch entry, and copies nothing if it holds for none. Entries
+    for which it does not hold keep `old`. Use it for updates that are rare and expensive, like the start of an episode.
 
     Only forward derivatives (`jax.jvp`) are supported: JAX cannot transpose a function with a custom batching rule.
 

@@ -35,7 +35,7 @@ class Gaussian(NamedTuple):
 
 
 def clip_log_std(log_std: Array) -> Array:
-    """Any shape; between SAC's limits."""
+    """`log_std`, of any shape, clipped to SAC's limits."""
     return jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
 
 

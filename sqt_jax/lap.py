@@ -19,6 +19,8 @@ BLOCK = 128
 
 
 class LapState(NamedTuple):
+    """The transitions, and the priorities from which they are drawn."""
+
     rows: RingState
     levels: tuple[Array, ...]  # [blocks, BLOCK] each: priorities, sums of their blocks, ...; the last has one block
     max_priority: Array  # []: the priority of new rows
@@ -108,8 +110,8 @@ def lap(
     def feedback(state: LapState, index: Array, td_error: Array, step: Array) -> LapState:
         new = priority(td_error, priority_exponent, min_priority)
         highest = jnp.maximum(state.max_priority, jnp.max(new))
-        there = state.levels[0][index // BLOCK, index % BLOCK] > 0  # not lost since it was drawn
-        levels = set_priorities(state.levels, index, jnp.where(there, new, 0.0))
+        available = state.levels[0][index // BLOCK, index % BLOCK] > 0  # not lost since it was drawn
+        levels = set_priorities(state.levels, index, jnp.where(available, new, 0.0))
         # Members share the condition: a real branch under vmap. It reads every priority, so it must stay rare.
         refresh = step % refresh_every == 0
         highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)

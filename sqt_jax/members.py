@@ -1,4 +1,4 @@
-"""The members of a sweep along devices.
+"""Spreads the members of a sweep over devices.
 
 Members never exchange anything. Each device runs the same compiled program on its share of them (`jax.shard_map` over a
 mesh of one axis), with its own loops and branches. Shares are equal: a sweep whose size is not a multiple of the number
@@ -28,7 +28,7 @@ def _is_axis(axis: Any) -> bool:
 
 
 class Layout(NamedTuple):
-    """S members along some devices.
+    """S members, and the devices that they are spread over.
 
     The devices may belong to several hosts (`jax.distributed`): then every process calls the sweep's functions with
     the same arguments and sees the members on its own devices.
@@ -39,15 +39,17 @@ class Layout(NamedTuple):
 
     @property
     def spread(self) -> bool:
+        """Whether there are several devices."""
         return len(self.devices) > 1
 
     @property
-    def held(self) -> int:
-        """S and the padding of the last device's share."""
+    def padded_size(self) -> int:
+        """S plus the padding that makes the devices' shares equal."""
         return len(self.devices) * math.ceil(self.members / len(self.devices)) if self.spread else self.members
 
     @property
     def mesh(self) -> Mesh:
+        """The devices as a mesh of one axis."""
         return Mesh(np.asarray(self.devices), (AXIS,))
 
     def specs(self, axes: Any) -> Any:
@@ -68,13 +70,13 @@ class Layout(NamedTuple):
         # Every device computes the leaves that members share in the same way; the check cannot see that.
         return jax.shard_map(mapped, mesh=self.mesh, **specs, check_vma=False)
 
-    def filled(self, leaf: Any) -> Any:
-        """[S, ...] -> [held, ...]"""
-        return leaf if self.held == self.members else leaf[np.arange(self.held) % self.members]
+    def padded(self, leaf: Any) -> Any:
+        """[S, ...] -> [padded_size, ...], with copies of the first members"""
+        return leaf if self.padded_size == self.members else leaf[np.arange(self.padded_size) % self.members]
 
 
 def usable_devices(members: int) -> int:
-    """How many devices of this process a sweep uses by default: the fewest that give each the smallest share."""
+    """The number of devices that a sweep uses by default: the fewest of this process that make shares smallest."""
     here = len(jax.local_devices())
     return math.ceil(members / math.ceil(members / here))
 

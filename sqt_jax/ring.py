@@ -18,7 +18,7 @@ MAX_FINAL_OBS = 2**24  # a row stores an index into `final_obs` as float32, whic
 
 
 class RingState(NamedTuple):
-    """What a ring holds. Transitions are numbered from 0 in order of arrival; number k is in row k mod capacity."""
+    """A ring's contents. Transitions are numbered from 0 in order of arrival; number k is in row k mod capacity."""
 
     storage: Array  # [capacity, W]: obs, action, reward, discount, index of the previous row's next obs (-1: this obs)
     final_obs: Array  # [F, O]: next observations of transitions that ended an episode

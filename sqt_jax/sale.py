@@ -33,12 +33,14 @@ class Encoder(nn.Module):
         self.state_action_layers = [Dense(width, name=f"state_action{i}") for i, width in enumerate(widths)]
 
     def zs(self, obs: Array) -> Array:
+        """obs [B, O] -> [B, Z]"""
         x = obs
         for layer in self.state_layers[:-1]:
             x = nn.elu(layer(x))
         return avg_l1_norm(self.state_layers[-1](x))
 
     def zsa(self, zs: Array, action: Array) -> Array:
+        """zs [B, Z], action [B, A] -> [B, Z]"""
         first, *others = self.state_action_layers[:-1]
         x = nn.elu(first(zs, action))
         for layer in others:

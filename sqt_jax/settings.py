@@ -21,7 +21,7 @@ class ConfigError(ValueError):
     """An invalid setting. `setting` is its name (the command line's flag without the dashes)."""
 
     def __init__(self, setting: str, message: str):
-        super().__init__(setting, message)  # both, so that it can be pickled: a pool of processes passes errors so
+        super().__init__(setting, message)  # both, so that it can be pickled and passed between processes
         self.setting, self.message = setting, message
 
     def __str__(self) -> str:
@@ -46,7 +46,7 @@ class Setting(NamedTuple):
     formerly: str | None = None  # its name in older files
 
     def expects(self) -> str:
-        """What its values are, in words: `a whole number of at least 1`."""
+        """The values that it may have, in words: `a whole number of at least 1`."""
         if self.choices:
             return f"one of {', '.join(self.choices)}"
         if self.type is bool:

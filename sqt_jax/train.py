@@ -28,10 +28,12 @@ class Means(NamedTuple):
 
     @classmethod
     def start(cls, like: Metrics) -> "Means":
+        """Means of no values, for metrics of these names and shapes."""
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), like)
         return cls(zeros, zeros)
 
     def add(self, metrics: Metrics) -> "Means":
+        """The means with one more value of each metric."""
         count = jax.tree.map(lambda n, x: n + ~jnp.isnan(x), self.measured, metrics)
         # The running mean stays near the values: a long interval does not lose digits, as a sum would.
         mean = jax.tree.map(
@@ -40,10 +42,13 @@ class Means(NamedTuple):
         return Means(mean, count)
 
     def result(self) -> Metrics:
+        """The means; NaN where nothing was measured."""
         return jax.tree.map(lambda m, n: jnp.where(n > 0, m, jnp.nan), self.mean, self.measured)
 
 
 class TrainState(NamedTuple):
+    """All that changes while one member trains."""
+
     agent: State
     timestep: TimeStep  # [E, ...]
     episodes: rollout.Episodes
@@ -78,7 +83,7 @@ class Sweep(NamedTuple):
 
 
 def new_interval(state: TrainState) -> TrainState:
-    """Resets what `measure` averages."""
+    """The state with the averages of `measure` reset."""
     means = jax.tree.map(jnp.zeros_like, state.means)
     return state._replace(episodes=state.episodes.forget_ended(), means=means)
 
@@ -88,7 +93,8 @@ def make_trainer(
 ) -> Trainer:
     """Joins an agent, an environment and a replay buffer into the training of one member.
 
-    Evaluation plays `eval_env`, by default `env`: the same task on other physics.
+    Args:
+      eval_env: the environment of evaluation, usually the same task on other physics; None: `env`.
     """
     num_envs = config.num_envs
     updates = num_envs * config.updates_per_step  # per lockstep step, so that UTD is per transition
@@ -231,7 +237,7 @@ def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
 
     init = layout.over_members(trainer.init, (0, 0), axes)
     return Sweep(
-        init=jax.jit(lambda *arguments: init(*jax.tree.map(layout.filled, arguments))),
+        init=jax.jit(lambda *arguments: init(*jax.tree.map(layout.padded, arguments))),
         advance=jax.jit(layout.over_members(trainer.advance, (axes, None, None), axes), donate_argnums=0),
         evaluate=jax.jit(layout.over_members(trainer.evaluate, (axes,), 0)),
         measure=jax.jit(layout.over_members(trainer.measure, (axes,), 0)),

@@ -1,4 +1,4 @@
-"""The few shapes of data that pass between modules.
+"""The data that pass between modules, and the interfaces of agents, environments and replays.
 
 Letters in shapes: `S` members of a sweep, `E` environments per member, `N` critics, `B` batch, `O` observation,
 `A` action; axis order `[S, N, B, ...]`. An interchangeable part (agent, replay, environment) is a NamedTuple of pure
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 Array = jax.Array
 Params = Any  # a pytree of arrays
-State = Any  # a pytree of arrays that only its owner looks into
+State = Any  # a pytree of arrays that only its owner reads
 Metrics = dict[str, Array]  # scalars by name
 
 
@@ -33,7 +33,7 @@ class Transition(NamedTuple):
 
 
 class TimeStep(NamedTuple):
-    """What an environment returns from `reset` and `step`.
+    """The result of an environment's `reset` and `step`.
 
     When an episode ends (`terminated` or `truncated`), `obs` is already the first observation of the next episode,
     `final_obs` the last one of the episode that ended. Elsewhere `final_obs` equals `obs`.
@@ -59,11 +59,11 @@ class Environment(NamedTuple):
     episode_length: int  # steps until truncation
     reset: Callable[[Array], TimeStep]  # key -> first time step
     step: Callable[[TimeStep, Array], TimeStep]  # (time step, action [A]) -> next time step
-    set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step there
+    set_physics: Callable[[Array, Array], TimeStep] | None = None  # (qpos, qvel) -> time step in that state
     status: Callable[[TimeStep], Metrics] = lambda timestep: {}  # counts to report, summed over environments
     # A lower bound on the mean episode length. 1 is always safe; a larger one saves memory in the replay (`Ring`).
     min_mean_episode_length: int = 1
-    # Forward speed in m/s of the step that led to this time step; None: the environment has no such notion.
+    # Forward speed in m/s of the step that led to this time step; None: the environment does not measure it.
     speed: Callable[[TimeStep], Array] | None = None
 
 
@@ -81,10 +81,13 @@ class Scalars(NamedTuple):
     temperature: Array | float  # SAC's; its start where it is learned
 
     def as_arrays(self) -> "Scalars":
+        """The same values as float32 arrays []."""
         return Scalars(*(jnp.asarray(value, jnp.float32) for value in self))
 
 
 class Init(Protocol):
+    """`Agent.init`."""
+
     def __call__(self, key: Array, scalars: Scalars | None = None) -> State:
         """A new agent.
 
@@ -94,11 +97,15 @@ class Init(Protocol):
 
 
 class Act(Protocol):
+    """`Agent.act`."""
+
     def __call__(self, state: State, obs: Array, key: Array, deterministic: bool = False) -> Array:
         """Actions [B, A] in [-1, 1] for obs [B, O]: exploring ones, or those of the policy that is evaluated."""
 
 
 class Update(Protocol):
+    """`Agent.update`."""
+
     def __call__(self, state: State, batch: Transition, key: Array, step: Array) -> tuple[State, Array, Metrics]:
         """One update of all networks that are due.
 
@@ -115,8 +122,10 @@ class Update(Protocol):
 
 
 class Observe(Protocol):
+    """`Agent.observe`."""
+
     def __call__(self, state: State, episode_return: Array, ended: Array, step: Array) -> State:
-        """What an agent learns from the progress of its episodes; called after each environment step.
+        """Reports the progress of the agent's episodes; called after each environment step.
 
         Only TD7 uses it, for its policy checkpoints. Without it TD7 acts with its initial policy for ever.
 
@@ -130,13 +139,13 @@ class Observe(Protocol):
 class Views(NamedTuple):
     """Read-only functions of an agent's state: for evaluation, for records, for saving a policy."""
 
-    policy: Callable[[State], Params]  # state -> what the deterministic policy needs of it
+    policy: Callable[[State], Params]  # state -> the parameters that the deterministic policy needs
     policy_action: Callable[[Params, Array], Array]  # (policy, obs [B, O]) -> action [B, A]
     q_values: Callable[[State, Array, Array], Array]  # (state, obs [B, O], action [B, A]) -> the critics' [N, B]
     # The stochastic policy whose values the critics estimate, if it is not the deterministic one:
     # (state, obs [B, O], key) -> action [B, A], entropy bonus [B].
     sample: Callable[[State, Array, Array], tuple[Array, Array]] | None = None
-    status: Callable[[State], Metrics] = lambda state: {}  # what is reported of the state itself
+    status: Callable[[State], Metrics] = lambda state: {}  # metrics of the state itself
 
 
 class Agent(NamedTuple):
@@ -188,7 +197,7 @@ class Replay(NamedTuple):
     feedback: Callable[[State, Array, Array, Array], State]
     size: Callable[[State], Array]  # state -> [] int32: how many of the newest transitions are complete
     rows: Callable[[State, Array | int, int], Array]  # (state, first, count) -> rows for a checkpoint [count, floats]
-    with_rows: Callable[[State, Array, Array | int], State]  # (state, such rows, first) -> state that has them again
+    with_rows: Callable[[State, Array, Array | int], State]  # (state, saved rows, first) -> state with them
     without_rows: Callable[[State], State]  # state -> the same with None in place of the arrays that `rows` covers
-    # A prefix tree of the state for `vmap`: 0, or None for what the members of a sweep share (they insert in lockstep).
+    # A prefix tree of the state for `vmap`: 0, or None for leaves that members share (they insert in lockstep).
     member_axes: Any = 0

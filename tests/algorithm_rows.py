@@ -9,7 +9,7 @@ from sqt_jax.config import SETTINGS
 
 
 def first_rows(kind):
-    """The first row of each kind: the others differ from it in numbers only and share its tests."""
+    """The first row of each kind; the others differ from it in numbers only."""
     found: dict = {}
     for algo, row in ALGORITHMS.items():
         found.setdefault(kind(row), algo)
@@ -20,7 +20,7 @@ KINDS = first_rows(lambda row: (row.build, row.settings.get("penalty")))
 
 
 def has_effect(algo, setting) -> bool:
-    """Whether a setting does anything with an algorithm's own settings."""
+    """Whether a setting has an effect with an algorithm's own settings."""
     return set(SETTINGS[setting].features) <= features_of(ALGORITHMS[algo], default_agent_config(algo))
 
 

@@ -1,4 +1,4 @@
-"""A headless Chromium, driven through its debugging pipe (the DevTools protocol): it needs nothing else."""
+"""A headless Chromium, driven through its debugging pipe (the DevTools protocol), without further packages."""
 
 import base64
 import json
@@ -19,14 +19,14 @@ PATIENCE = 60  # seconds that an answer may take
 
 
 def find() -> str | None:
-    """A browser of this machine."""
+    """The path of a browser on this machine; None without one."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 class Page:
-    """One page of a browser. `errors` are what its console has shown, `requests` the addresses it asked for.
+    """One page of a browser. `errors` are its console's messages, `requests` the addresses it requested.
 
-    Requests are by their ids; one that the page's own policy has stopped is none.
+    Requests are keyed by their ids; those that the page's own policy stopped are not in it.
     """
 
     def __init__(self, reading: int, writing: int):
@@ -48,7 +48,7 @@ class Page:
             self._event(self._receive())
 
     def run(self, script: str) -> Any:
-        """The value of a JavaScript expression; of a promise, what it promises."""
+        """The value of a JavaScript expression; of a promise, its result."""
         answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
@@ -63,12 +63,12 @@ class Page:
         self.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
 
     def press(self, key: str, text: str = "") -> None:
-        """A key, by its name in the protocol, such as `Enter` with the text of a line's end."""
+        """Presses a key, by its name in the protocol; `Enter` has the text of a line's end."""
         for kind in ("keyDown", "keyUp"):
             self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, **({"text": text} if text else {}))
 
-    def screenshot(self, path: Path, whole: bool = True) -> None:
-        answer = self.send("Page.captureScreenshot", captureBeyondViewport=whole)
+    def screenshot(self, path: Path, full_page: bool = True) -> None:
+        answer = self.send("Page.captureScreenshot", captureBeyondViewport=full_page)
         path.write_bytes(base64.b64decode(answer["data"]))
 
     def pdf(self) -> bytes:
@@ -118,7 +118,7 @@ class Page:
 
 @contextmanager
 def opened(browser: str, profile: Path) -> Iterator[Page]:
-    """A browser with one page, and with a folder for what it keeps."""
+    """A browser with one page, and a folder for its files."""
     to_browser, writing = os.pipe()
     reading, from_browser = os.pipe()
     # The browser reads its file 3 and writes its file 4.

@@ -1,4 +1,4 @@
-"""What all tests share: the cache of compiled programs, hypothesis' profile, strict promotion."""
+"""Shared by all tests: the cache of compiled programs, hypothesis' profile, strict promotion."""
 
 import functools
 import os
@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # Before JAX is imported, and through the environment, so that processes started by tests share the cache.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-# Most of a test's time is compilation, and this halves it: no optimisation, and no parts of a program side by side, as
+# Most of a test's time is compilation, and this halves it: no optimisation, and no parallel compilation, because
 # two test processes keep the cores busy. `make test-all` sets XLA_FLAGS to nothing: programs as users compile them.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
 
@@ -30,7 +30,7 @@ def strict_dtypes() -> Iterator[None]:
     """No implicit promotion between dtypes: an accidental float64 or int32 becomes an error.
 
     For tests of this repository's own arithmetic (`pytestmark = pytest.mark.usefixtures("strict_dtypes")`); MJX does
-    not bear it.
+    not work with it.
     """
     with jax.numpy_dtype_promotion("strict"):
         yield
@@ -52,7 +52,7 @@ def shared_programs() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def tiny_tasks() -> Iterator[None]:
-    """Every task is `probe_envs.constant_reward`: whole runs of `--env=ant` in a second.
+    """Every task is `probe_envs.constant_reward`: complete runs of `--env=ant` in a second.
 
     For modules that start many runs (`pytestmark = pytest.mark.usefixtures("tiny_tasks")`).
     """

@@ -1,4 +1,4 @@
-"""What Gymnasium's own environments do from recorded states, and what ours do: computed once for all tests.
+"""Steps of Gymnasium's own environments and of ours from recorded states, computed once for all tests.
 
 MJX takes long to compile, so there is one compiled step per task here, of `COUNT` environments.
 """

@@ -1,4 +1,4 @@
-"""Curves of tabular algorithms, made up."""
+"""Invented learning curves of tabular algorithms."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ STEPS = np.array([100, 1000, 10_000])
 
 
 def curves(coefs=(None,), tables=1, bias=0.1, error=(3.0, 2.0, 1.0), std=0.0, ratio=0.5, seeds=4):
-    """A number or one per measurement for each quantity; seeds differ by a little."""
+    """Curves with these quantities, each a number or one per measurement; seeds differ by a little."""
     spread = 1 + 0.01 * np.arange(seeds)[:, None, None]
     shape = (seeds, len(coefs), len(STEPS))
 

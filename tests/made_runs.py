@@ -15,7 +15,7 @@ from experiments.running.records import EVALUATION_COLUMNS
 from sqt_jax.algorithms import agent_of, make_config
 from sqt_jax.policy import save_policy
 
-# Markup, and what no terminal should see.
+# Markup, and characters that no terminal should get.
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'`${1}\x1b\ud800"
 STEPS = 100  # of a made run, evaluated at 0, 50 and 100, with updates after 10
 
@@ -91,7 +91,7 @@ def made_member(algo="td3", env="cheetah", returns=(0, 1, 2), seed=0, run="run",
 
 
 def make_hostile(path):
-    """Puts markup wherever a run's files may hold words of their own."""
+    """Puts markup into every free text of a run's files."""
     content = json.loads((path / "config.json").read_text())
     content |= {"preset": HOSTILE, "started": HOSTILE, "commit": HOSTILE, "command": ["run", f"--name={HOSTILE}"]}
     content |= {"versions": {HOSTILE: HOSTILE, "jax": HOSTILE}, "device": {"platform": HOSTILE, "kind": HOSTILE}}
@@ -101,7 +101,7 @@ def make_hostile(path):
 
 
 def add_policies(path, env, returns=None):
-    """Gives a made run policies that have learned nothing, and a summary with the members' final `returns`.
+    """Gives a made run untrained policies, and a summary with the members' final `returns`.
 
     Args:
       env: an `Environment` of the run's sizes.
@@ -110,9 +110,11 @@ def add_policies(path, env, returns=None):
     config, count = run.members[0].config, len(run.members)
     agent, generator = agent_of(config, env), np.random.default_rng(1)
     shapes = jax.eval_shape(lambda key: jax.vmap(agent.init)(jax.random.split(key, count)), jax.random.key(1))
-    # by NumPy: to compile the agent's own start takes seconds
+    # by NumPy: compiling the agent's own `init` takes seconds
     state = jax.tree.map(lambda leaf: generator.normal(0, 0.5, leaf.shape).astype(leaf.dtype), shapes)
-    with mock.patch("sqt_jax.policy._exported", return_value=b""):  # for use elsewhere; it takes seconds
+    with mock.patch(
+        "sqt_jax.policy._exported", return_value=b""
+    ):  # the exported program takes seconds and is not needed
         save_policy(path / "policy", config, env, state)
     if returns is not None:
         members = [{"member": index, "final_return": value} for index, value in enumerate(returns)]

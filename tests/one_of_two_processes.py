@@ -1,4 +1,4 @@
-"""What each of the processes of test_members trains: ADDRESS RANK FILE; the returns of all members go into FILE."""
+"""The program of each process of test_members: ADDRESS RANK FILE; it writes the returns of all members to FILE."""
 
 import sys
 

@@ -24,14 +24,14 @@ def one_step() -> Environment:
     return make_environment("one_step", 1, 1, 10, start, advance)
 
 
-def shorter_than_it_says() -> Environment:
+def shorter_than_stated() -> Environment:
     """`one_step`, whose replay has room for the final observations of longer episodes."""
     return one_step()._replace(min_mean_episode_length=8)
 
 
 @functools.cache  # the same environment is the same object, so that its runs can share their programs
 def constant_reward(episode_length: int = 5) -> Environment:
-    """Reward 1 for ever; only the time limit ends episodes, so Q = 1 / (1 - gamma) everywhere."""
+    """Reward 1 at each step; only the time limit ends episodes, so Q = 1 / (1 - gamma) everywhere."""
 
     def start(key):
         obs = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
@@ -62,7 +62,7 @@ class Named(NamedTuple):
 
 
 def with_a_field_called_inserted() -> Environment:
-    """A state with a field of the name of one of the trainer's counters."""
+    """A state with a field that has the name of one of the trainer's counters."""
 
     def start(key):
         value = jax.random.uniform(key, minval=1.0, maxval=2.0)
@@ -75,7 +75,7 @@ def with_a_field_called_inserted() -> Environment:
 
 
 def diverging() -> Environment:
-    """An action above 0 makes an observation that is not a number, and an infinite reward; others earn 1."""
+    """An action above 0 makes the observation NaN and the reward infinite; other actions earn 1."""
 
     def start(key):
         obs = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)

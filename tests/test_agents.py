@@ -1,4 +1,4 @@
-"""What every row of the table of algorithms promises: shapes, laws, clocks and members."""
+"""Properties of every row of the table of algorithms: shapes, laws, clocks and members."""
 
 import dataclasses
 from functools import cache, partial
@@ -50,7 +50,7 @@ def make_batch(seed, size=B) -> Transition:
     return Transition(*(jnp.asarray(field, jnp.float32) for field in fields))
 
 
-# For what runs a few times only: compiles in half the time.
+# For functions that run a few times only: compiles in half the time.
 quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
@@ -128,7 +128,7 @@ def enough(algo):
 
 
 def numbers(tree):
-    """A tree's leaves but typed keys, as numpy arrays."""
+    """A tree's leaves except typed keys, as NumPy arrays."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
     return [np.asarray(leaf) for leaf in leaves]
 
@@ -151,7 +151,7 @@ def learned(state):
 
 
 @every_variant
-def test_a_variant_starts_exactly_as_its_base(algo):
+def test_a_variant_starts_exactly_as_its_baseline(algo):
     scalars = subject(algo).config.scalars()
     ours, plain = (jax.make_jaxpr(subject(name).agent.init)(KEY, scalars) for name in (algo, base_of(algo)))
     assert str(ours) == str(plain)
@@ -187,7 +187,7 @@ def test_three_updates_are_finite_and_have_these_shapes(algo, n):
 
 @every_algorithm
 def test_dtypes_do_not_promote_by_accident(algo):
-    """All but the optimizer's step, which is optax's."""
+    """Everything except the optimizer's step, which is optax's."""
     config, parts, agent, *_ = subject(algo)
     state, batch = jax.eval_shape(agent.init, KEY), make_batch(0)
     with jax.numpy_dtype_promotion("strict"):
@@ -199,7 +199,7 @@ def test_dtypes_do_not_promote_by_accident(algo):
 
 
 @every_algorithm
-def test_update_is_the_parts_update_with_its_own_draws(algo):
+def test_update_of_the_agent_is_that_of_the_parts_with_its_own_draws(algo):
     """The same program, so that nothing needs to be compiled."""
     _, parts, agent, *_ = subject(algo)
     arguments = jax.eval_shape(agent.init, KEY), make_batch(0), KEY, jnp.int32(0)
@@ -278,8 +278,8 @@ def test_td3_smooths_the_target_action_within_its_clip():
 
 
 @every_variant
-def test_coefficient_zero_is_the_plain_algorithm_bit_for_bit(algo):
-    """The target is so by arithmetic (test_q_targets); the rest because XLA compiles it alike in both programs."""
+def test_coefficient_zero_is_the_baseline_bit_for_bit(algo):
+    """For the target by arithmetic (test_q_targets); for the rest because XLA compiles both programs alike."""
     plain, _ = run(base_of(algo), start(base_of(algo)), enough(algo))
     ours, _ = run(algo, start(algo, scalars=subject(algo).config.scalars()._replace(penalty_coef=0.0)), enough(algo))
     assert same(learned(ours[-1]), learned(plain[-1]))
@@ -297,7 +297,7 @@ def test_a_positive_coefficient_changes_target_and_training(algo):
 
 
 @every_variant
-def test_the_target_is_the_plain_target_less_the_penalty(algo):
+def test_the_target_is_the_baselines_target_minus_the_penalty(algo):
     inside, outside = subject(algo).parts, subject(algo, penalty_inside_gamma=False).parts
     plain, state, batch = subject(base_of(algo)).parts, start(algo), make_batch(0)
 
@@ -402,7 +402,7 @@ def test_each_networks_first_step_has_the_learning_rates_length(algo):
 
 
 @algorithm_rows.every(KINDS, fast=ONE_OF_EACH)
-def test_members_side_by_side_are_each_member_alone(algo):
+def test_members_in_a_sweep_train_as_each_member_alone_does(algo):
     agent, update = subject(algo).agent, subject(algo).update
     default = subject(algo).config.scalars()
     coefs = (0.0, 0.5, 1.0) if algo in VARIANTS else (0.0, 0.0, 0.0)
@@ -452,7 +452,9 @@ def test_a_swept_scalar_shares_one_compilation_and_matters(algo, name):
 def learning_temperature():
     """SAC with a learned temperature, and a start whose policy has a narrow or a wide standard deviation."""
     own = subject("sac", learn_temperature=True)
-    first = quick_jit(lambda scalars: own.agent.init(KEY, scalars).log_temperature)  # of init, what depends on scalars
+    first = quick_jit(
+        lambda scalars: own.agent.init(KEY, scalars).log_temperature
+    )  # the part of init that depends on scalars
 
     def make(log_std, temperature):
         scalars = own.config.scalars()._replace(lr=1e-2, temperature=temperature).as_arrays()
@@ -511,7 +513,7 @@ def test_a_random_subset_of_critics_makes_the_target(algo):
     assert not np.array_equal(pairs[0, 0], pairs[1, 1])
 
 
-HUGE = 1e12  # finite, and too large to be true
+HUGE = 1e12  # finite, beyond `critic.LARGEST_VALUE`
 
 
 def with_huge_values(state):
@@ -531,7 +533,7 @@ FAULTS = {
 
 @every_kind
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_diverged_agent_stays_as_it_was_for_good(algo, fault):
+def test_a_diverged_agent_never_changes_again(algo, fault):
     def parts(state, *without):
         return with_learner(state, **dict.fromkeys(("diverged", *without)))
 
@@ -545,6 +547,6 @@ def test_a_diverged_agent_stays_as_it_was_for_good(algo, fault):
     encoder = [name for name in ("encoder", "encoder_opt") if hasattr(learner(state), name)]
     assert same(parts(after, *encoder), parts(state, *encoder))
     assert all(np.isfinite(leaf).all() for leaf in numbers(after))
-    # What comes later, however good, changes nothing.
+    # Later updates change nothing, even valid ones.
     later = update(update(after, batch, KEY, 4)[0], batch, KEY, 5)[0]
     assert later.diverged and same(parts(later), parts(after))

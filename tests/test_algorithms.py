@@ -1,4 +1,4 @@
-"""The table of algorithms: its names, its rows, and that the functions of a name are those of its row."""
+"""The table of algorithms: its names, its rows, and the functions that belong to a name."""
 
 import dataclasses
 
@@ -46,7 +46,7 @@ def test_the_table_has_these_names():
 
 
 @pytest.mark.parametrize("algo", NAMES)
-def test_each_name_is_its_bases_agent_with_its_variants_penalty(algo):
+def test_each_name_is_its_baselines_agent_with_its_variants_penalty(algo):
     agent = make_config(algo, "ant").agent
     state = jax.eval_shape(make_agent(algo, 3, 2).init, jax.random.key(0))
     assert isinstance(state, STATES[NAMES[algo]])
@@ -54,7 +54,7 @@ def test_each_name_is_its_bases_agent_with_its_variants_penalty(algo):
 
 
 @pytest.mark.parametrize("algo", [name for name, row in ALGORITHMS.items() if row.baseline])
-def test_a_variant_differs_from_its_base_by_the_penalty_alone(algo):
+def test_a_variant_differs_from_its_baseline_only_in_the_penalty(algo):
     ours, plain = make_config(algo, "ant").flat(), make_config(base_of(algo), "ant").flat()
     assert {name for name in ours if ours[name] != plain[name]} == {"algo", "penalty", "penalty_coef"}
     fields = ("build", "build_released", "features", "training", "follows")
@@ -110,7 +110,7 @@ def test_rows_name_settings_that_exist(algo):
     assert row.baseline is None or row.baseline in BASELINES
 
 
-def test_every_feature_is_some_algorithms_and_some_settings():
+def test_every_feature_belongs_to_an_algorithm_and_to_a_setting():
     assert {feature for about in SETTINGS.values() for feature in about.features} == set(FEATURES)
 
 
@@ -121,8 +121,8 @@ def test_settings_override_the_row():
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_no_other_penalty_than_the_names_own_is_taken(algo):
-    """A run would be another algorithm than its name says."""
+def test_any_penalty_but_that_of_the_algorithms_name_is_rejected(algo):
+    """Otherwise a run would train another algorithm than its name says."""
     own = make_config(algo, "ant").agent.penalty
     for penalty in ("none", "batch_std", "transition_std"):
         if penalty == own:
@@ -133,7 +133,7 @@ def test_no_other_penalty_than_the_names_own_is_taken(algo):
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_several_environments_are_refused_for_td7_alone(algo):
+def test_several_environments_are_rejected_for_td7_only(algo):
     settings = {"num_envs": 4, "warmup_steps": 400, "eval_every": 400, "steps": 4000}
     if algo in TD7:
         with pytest.raises(ConfigError, match=f"--num_envs: expects 1 for {algo}, ") as error:
@@ -144,7 +144,7 @@ def test_several_environments_are_refused_for_td7_alone(algo):
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_an_environment_of_ones_own_gives_the_sizes(algo):
+def test_a_custom_environment_gives_the_sizes(algo):
     env = constant_reward()
     config = make_config(algo, "ant", hidden=(5,), ensemble_size=3, replay_capacity=300)
     agent = jax.eval_shape(agent_of(config, env).init, jax.random.key(0))
@@ -160,8 +160,8 @@ def test_an_environment_of_ones_own_gives_the_sizes(algo):
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_row_makes_a_whole_run(algo):
-    """Traced, not compiled: that every part of the row fits the train loop."""
+def test_every_row_makes_a_complete_run(algo):
+    """Traced, not compiled: every part of the row fits the train loop."""
     env = constant_reward()
     config = make_config(algo, "ant", hidden=(5, 4), steps=1000, warmup_steps=300, eval_every=500, eval_episodes=2)
     state, history = jax.eval_shape(jax.vmap(make_train(config, env)), jax.random.split(jax.random.key(0), 3))
@@ -178,7 +178,7 @@ def test_every_row_makes_a_whole_run(algo):
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_the_replay_is_lap_for_td7_alone_with_the_agents_settings(algo):
+def test_only_td7s_replay_is_lap_with_the_agents_settings(algo):
     env = constant_reward()
     if algo not in TD7:
         state = replay_of(make_config(algo, "ant", replay_capacity=300), env).init()

@@ -29,7 +29,7 @@ def console():
     return Console(file=io.StringIO(), force_terminal=False, width=100, color_system=None, legacy_windows=False)
 
 
-def test_share_of_evaluation_of_the_full_protocol():
+def test_share_of_evaluation_in_the_papers_protocol():
     text = evaluation_share(1_000_000, 201, 10, 1_000)
     assert "201 evaluations of 10 episodes" in text
     assert "up to 2,010,000 steps (67% of all)" in text

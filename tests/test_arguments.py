@@ -1,3 +1,5 @@
+"""Command lines of the commands that read runs: flags, error lines, exit codes, written files."""
+
 import argparse
 
 import pytest
@@ -40,17 +42,17 @@ def test_runs_and_flags_in_any_order(parser):
         (["a", "--overwrite=yes"], "--overwrite: is a switch and expects no value"),
     ],
 )
-def test_what_cannot_be_is_rejected_in_a_line(parser, argv, message):
+def test_invalid_arguments_are_rejected_in_one_line(parser, argv, message):
     with pytest.raises(UsageError) as error:
         parser.read(["tables", *argv])
     assert str(error.value) == message
 
 
 def test_exit_codes(parser, capsys):
-    def refuse(argv):
+    def reject(argv):
         raise UsageError("--out=a\nb: no")
 
-    assert guarded(refuse, []) == 2
+    assert guarded(reject, []) == 2
     assert capsys.readouterr().err == "--out=a\\nb: no\n"
     assert guarded(parser.read, ["tables", "--help"]) == 0
     shown = capsys.readouterr().out
@@ -58,7 +60,7 @@ def test_exit_codes(parser, capsys):
     assert guarded(parser.read, ["tables", "a"]) == 0
 
 
-def test_files_are_replaced_only_where_that_is_asked_for(tmp_path):
+def test_files_are_replaced_only_with_overwrite(tmp_path):
     out = tmp_path / "new" / "tables"
     arguments.reject_existing(out, ["a.csv"], overwrite=False)
     arguments.write_files(out, {"a.csv": b"1"})
@@ -93,7 +95,7 @@ def test_a_link_is_replaced_and_not_written_through(tmp_path):
     assert (tmp_path / "precious").read_text() == "x" and not (tmp_path / "a.csv").is_symlink()
 
 
-def test_one_file_is_written_whole(tmp_path):
+def test_a_file_is_written_completely(tmp_path):
     out = tmp_path / "new" / "report.html"
     for content in (b"1", b"2"):
         arguments.write_file(out, content)
@@ -104,12 +106,12 @@ def test_one_file_is_written_whole(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", ".", "/", "folder/", "a\0b"])
-def test_what_can_be_no_file(text):
+def test_paths_that_cannot_be_a_file(text):
     with pytest.raises(argparse.ArgumentTypeError, match="expects a file"):
         arguments.file(text)
 
 
-def test_what_is_not_to_be_seen_is_escaped():
+def test_unprintable_characters_are_escaped():
     assert arguments.printable("a\x1b[1m\n\u202e\ud800é", kept="\n") == "a\\x1b[1m\n\\u202e\\ud800é"
 
 
@@ -129,7 +131,7 @@ def test_a_command_for_one_run_expects_one():
             made.read(["play", "a", f"--seed={text}"])
 
 
-def test_a_file_that_could_not_be_written_is_rejected_before(tmp_path):
+def test_a_file_that_could_not_be_written_is_rejected_in_advance(tmp_path):
     reject_file("--video", tmp_path / "new" / "folder" / "film.mp4", overwrite=False)
     (tmp_path / "film.mp4").write_text("x")
     (tmp_path / "link.mp4").symlink_to("nowhere")

@@ -90,7 +90,7 @@ def test_actions_are_clipped():
     assert play([[-7.0, 0.0, 0.0]])[-1].obs[2] == -1
 
 
-def test_a_reset_is_not_an_end():
+def test_a_reset_does_not_end_an_episode():
     timestep = play([])[0]
     assert not timestep.terminated
     assert not timestep.truncated
@@ -151,7 +151,7 @@ def test_a_step_that_is_not_finite_terminates_with_reward_0_and_the_observation_
     np.testing.assert_array_equal(after.final_obs, before.obs)
     assert after.state.steps == 0
     assert all(np.isfinite(x).all() for x in leaves(after))
-    assert ENV.step(after, GO).reward == 1  # the next episode is not harmed
+    assert ENV.step(after, GO).reward == 1  # the next episode is unaffected
 
 
 def test_steps_beyond_all_numbers_are_counted_over_all_episodes():

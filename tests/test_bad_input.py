@@ -35,7 +35,7 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def folder(finished, tmp_path, monkeypatch):
-    """The working directory: a copy of the finished run, and files that are none of a run."""
+    """The working directory: a copy of the finished run, and files that do not belong to a run."""
     shutil.copytree(finished, tmp_path / "runs")
     (tmp_path / "file").write_text("mine")
     (tmp_path / "empty").mkdir()
@@ -44,7 +44,7 @@ def folder(finished, tmp_path, monkeypatch):
 
 
 def snapshot(path):
-    """All that is below a folder: names, bytes and where links lead."""
+    """The contents of a folder: names, bytes and the targets of links."""
     found = {}
     for item in path.rglob("*"):
         link = item.readlink() if item.is_symlink() else None
@@ -129,11 +129,11 @@ def short(value):
 
 
 @pytest.mark.parametrize(("argument", "begins", "expects"), FLAGS, ids=[short(row[0]) for row in FLAGS])
-def test_a_bad_flag_is_rejected(folder, capsys, argument, begins, expects):
+def test_an_invalid_flag_is_rejected(folder, capsys, argument, begins, expects):
     rejected(folder, capsys, [*NEW.split(), argument], begins, expects)
 
 
-# Flags that do not go together
+# Flags that exclude each other
 
 TOGETHER = [
     ("--algo=sac --penalty_coef=0.5", "--penalty_coef:", "has no effect with sac"),
@@ -159,7 +159,7 @@ TOGETHER = [
 
 
 @pytest.mark.parametrize(("arguments", "begins", "expects"), TOGETHER, ids=[row[0] for row in TOGETHER])
-def test_flags_that_cannot_be_together_are_rejected(folder, capsys, arguments, begins, expects):
+def test_flags_that_exclude_each_other_are_rejected(folder, capsys, arguments, begins, expects):
     rejected(folder, capsys, [*NEW.split(), *arguments.split()], begins, expects)
 
 
@@ -197,15 +197,15 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_a_bad_file_of_flags_is_rejected(folder, capsys, case):
+def test_an_invalid_file_of_flags_is_rejected(folder, capsys, case):
     content, expects = FILES[case]
     (folder / "flags.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
-    given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would win
+    given = [word for word in NEW.split() if not word.startswith("--steps")]  # the command line would override it
     rejected(folder, capsys, [*given, "--config=flags.yaml"], "--", expects)
 
 
 @pytest.mark.parametrize("path", ["none.yaml", "empty", "/dev/zero", "x" * 300, "fifo", "lön\x07k"])
-def test_what_is_no_file_is_rejected(folder, capsys, path):
+def test_a_path_that_is_no_file_is_rejected(folder, capsys, path):
     os.mkfifo(folder / "fifo")
     rejected(
         folder, capsys, [*NEW.split(), f"--config={path}"], "--config=", "expects a file|no such file|cannot be read"
@@ -237,7 +237,7 @@ def without(key):
     return lambda config: config.pop(key)
 
 
-# What is changed in config.json.
+# Changes of config.json.
 CHANGED = {
     "unknown setting": (settings(stepz=5), "--stepz: is not a setting"),
     "setting out of range": (settings(gamma=2), "--gamma: expects a number from 0 to 1"),
@@ -271,7 +271,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("case", CHANGED)
-def test_a_run_whose_settings_cannot_be_is_rejected(folder, capsys, case):
+def test_a_run_with_invalid_settings_is_rejected(folder, capsys, case):
     change, expects = CHANGED[case]
     config = json.loads((RUN / "config.json").read_text())
     change(config)
@@ -310,7 +310,7 @@ def a_folder(name):
     return damage
 
 
-# What is done to a run's folder, given its config.json.
+# Damage to a run's folder, as a function of its config.json.
 DAMAGED = {
     "no config": (Path.unlink, "it has no config.json"),
     "truncated": (truncated, "does not describe a run"),
@@ -340,12 +340,12 @@ DAMAGED = {
 def test_a_damaged_run_is_rejected(folder, capsys, case):
     damage, expects = DAMAGED[case]
     damage(RUN / "config.json")
-    further = ["--steps=160"] if case.startswith("table") else []  # else it is finished, and left as it is
+    further = ["--steps=160"] if case.startswith("table") else []  # otherwise the run is finished and not changed
     rejected(folder, capsys, [f"--resume={RUN}", *further], f"--resume={RUN}:", expects)
 
 
 ITS_OWN = r"expects the run's own settings; these differ: "
-# The run is whole; `RUN` stands for its folder, `NEW` for the flags that made it.
+# The run is complete; `RUN` stands for its folder, `NEW` for the flags that made it.
 RESUMED = [
     ("--resume=none", "--resume=none:", "expects the folder of a run"),
     ("--resume=file", "--resume=file:", "expects the folder of a run"),
@@ -372,7 +372,7 @@ RESUMED = [
 
 
 @pytest.mark.parametrize(("arguments", "begins", "expects"), RESUMED, ids=[short(row[0]) for row in RESUMED])
-def test_a_resume_that_cannot_be_is_rejected(folder, capsys, arguments, begins, expects):
+def test_an_invalid_resume_is_rejected(folder, capsys, arguments, begins, expects):
     text = arguments.replace("RUN", str(RUN)).replace("NEW", NEW)
     rejected(folder, capsys, text.split(" "), begins.replace("RUN", str(RUN)), expects.replace("RUN", str(RUN)))
 
@@ -409,13 +409,13 @@ NOT_RUNS = [foreign_file, foreign_folder, a_link_below, a_link_itself, a_link_to
 
 
 @pytest.mark.parametrize("change", NOT_RUNS, ids=[change.__name__ for change in NOT_RUNS])
-def test_what_is_not_a_run_alone_is_not_replaced(folder, capsys, change):
+def test_a_folder_with_other_files_than_a_run_is_not_replaced(folder, capsys, change):
     change(RUN)
     expects = "expects a folder that holds a run and nothing else"
     rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], f"--overwrite: {RUN}", expects)
 
 
-def test_a_file_in_a_runs_place_is_not_replaced(folder, capsys):
+def test_a_file_at_the_path_of_a_run_is_not_replaced(folder, capsys):
     shutil.rmtree(RUN)
     RUN.write_text("mine")
     rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--out=runs:", "expects a folder")
@@ -430,7 +430,7 @@ with files.locked(pathlib.Path(sys.argv[1])):
 """
 
 
-def test_a_run_at_which_another_process_is_at_work_is_rejected(folder, capsys):
+def test_a_run_that_another_process_is_training_is_rejected(folder, capsys):
     command = [sys.executable, "-c", HOLD, str(RUN.absolute())]
     pipe = subprocess.PIPE
     root = Path(__file__).resolve().parent.parent

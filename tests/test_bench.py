@@ -91,7 +91,7 @@ def test_peers_do_not_allocate_memory_in_advance(run, monkeypatch):
     assert seen[0]["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
 
 
-def test_a_file_that_cannot_be_written_ends_it_with_a_line_after_the_table(run, tmp_path, capsys):
+def test_a_file_that_cannot_be_written_is_an_error_line_after_the_table(run, tmp_path, capsys):
     def measure_all(request, environment, **timing):
         (tmp_path / "bench.json").mkdir()
         yield Measurement("loop", "a", 5, "env steps", 10.0)

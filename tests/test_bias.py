@@ -36,7 +36,7 @@ def truth_of_countdown(obs):
     return jnp.array([1.75, 1.5, 1.0])[obs[:, 0].astype(int)]
 
 
-def test_critics_that_are_right_have_no_bias():
+def test_exact_critics_have_no_bias():
     evaluation, found = measure(countdown(3), lambda obs: jnp.stack([truth_of_countdown(obs)] * 2), 0.5)
     np.testing.assert_allclose(found, 0, atol=1e-6)
     np.testing.assert_array_equal(evaluation.returns, [3, 3])
@@ -58,8 +58,8 @@ def test_bonuses_count_from_the_next_action_on():
     np.testing.assert_allclose(found, 0, atol=1e-6)
 
 
-def test_where_the_time_limit_ends_an_episode_its_last_states_do_not_count():
-    # Q = 1 / (1 - gamma) for ever; of 40 steps those count after which 0.5^steps is at most 1 %: the first 34.
+def test_the_last_states_of_a_truncated_episode_do_not_count():
+    # Q = 1 / (1 - gamma) everywhere; of 40 steps those count after which 0.5^steps is at most 1 %: the first 34.
     _, found = measure(constant_reward(40), lambda obs: jnp.full((1, len(obs)), 2.0), 0.5)
     exact = np.mean([2 - (2 - 2 * 0.5 ** (40 - step)) for step in range(34)])
     np.testing.assert_allclose(found[0], exact, rtol=1e-3)

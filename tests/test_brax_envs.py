@@ -21,7 +21,7 @@ def pendulum():
     return env, jax.jit(env.step)
 
 
-def test_the_names_are_braxs_but_for_its_test_environment():
+def test_the_names_are_braxs_except_its_test_environment():
     from brax import envs as theirs
 
     assert {name.removeprefix("brax:") for name in NAMES} == set(theirs._envs) - {"fast"}
@@ -42,7 +42,7 @@ def test_steps_are_braxs(pendulum):
         np.testing.assert_allclose(timestep.reward, state.reward, rtol=1e-6)
 
 
-def test_an_episode_ends_with_its_own_observation_and_goes_on_from_a_new_start(pendulum):
+def test_an_episode_ends_with_its_own_observation_and_the_next_has_a_new_start(pendulum):
     env, step = pendulum
     timestep = env.reset(jax.random.key(0))
     starts = [timestep.obs]

@@ -51,4 +51,4 @@ def test_a_run_on_brax_is_played(tmp_path, capsys):
     _, positions = states_in((tmp_path / "film.html").read_bytes())
     assert len(lengths) == 2 and len(positions) == sum(lengths) and not np.allclose(positions[0], positions[4])
     assert main([*argv[:2], "--steps=5"]) == 0
-    assert capsys.readouterr().out.endswith("--video=FILE.html films it\n")
+    assert capsys.readouterr().out.endswith("--video=FILE.html writes a film\n")

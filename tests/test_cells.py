@@ -1,3 +1,5 @@
+"""Numbers and footnotes of result tables."""
+
 import pytest
 
 from experiments.evidence.cells import Notes, finite, interval, joined, number
@@ -13,13 +15,13 @@ def test_numbers(value, text):
     assert number(value) == text
 
 
-def test_what_is_not_known_is_no_number():
+def test_unknown_values_are_not_shown_as_numbers():
     assert interval(3.0, 12.5) == "[3.00, 12.5]" and interval(None, 1.0) == interval(1.0, None) == ""
     assert finite(2) == 2.0 and finite(NAN) is finite(float("inf")) is finite(None) is None
     assert joined([4.0, 0.125, 12345678.5]) == "4 0.125 12345678.5"
 
 
-def test_footnotes_are_numbered_as_they_come_and_each_once():
+def test_footnotes_are_numbered_in_order_of_first_use():
     notes = Notes(["first"])
     assert notes("second", "first") == (1, 2) and notes("second", "second") == (2,) and notes() == ()
     assert notes.texts == ["first", "second"]

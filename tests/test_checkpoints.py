@@ -20,12 +20,12 @@ from sqt_jax.algorithms import ALGORITHMS, replay_of
 from sqt_jax.members import Layout
 
 SEEDS = (0, 1, 2)
-CAPACITY = 64  # less than the steps: the ring goes round
+CAPACITY = 64  # fewer than the steps: the ring overwrites rows
 LENGTHS = {"evaluations": 10, "metrics": 20}
 
 
 class Case:
-    """A small sweep, and states of it."""
+    """A small sweep and its states."""
 
     def __init__(self, algo="td3_sqt", devices=1, make_env=probe_envs.one_step, **settings):
         small = {"embedding_size": 16} if "checkpoints" in ALGORITHMS[algo].features else {}
@@ -48,7 +48,7 @@ class Case:
         return CheckpointStore(folder / "checkpoint", self.replay, self.layout, keep, self.said.append)
 
     def saved(self, store, *steps):
-        """Saves at these steps of one training; the state at the last of them."""
+        """Saves at these steps of one training; returns the state at the last one."""
         state = self.trained(40)
         for at in steps:
             state = self.advance(state, at - int(state.env_steps), at > 40)
@@ -58,7 +58,7 @@ class Case:
 
 
 def same(one, other):
-    """Bit for bit, except final observations that no transition needs any more: a checkpoint does not hold those."""
+    """Bit for bit, except final observations that no transition needs any more, which a checkpoint leaves out."""
 
     def held(state):
         replay = state.replay
@@ -85,8 +85,8 @@ def listing(store):
     return sorted(path.name for path in store.path.iterdir())
 
 
-@algorithm_rows.every(fast=("td7_sqt_tuple",))  # the other tests here take td3_sqt
-def test_every_algorithm_goes_on_bit_for_bit(algo, tmp_path):
+@algorithm_rows.every(fast=("td7_sqt_tuple",))  # the other tests here use td3_sqt
+def test_every_algorithm_resumes_bit_for_bit(algo, tmp_path):
     case = Case(algo)
     store = case.store(tmp_path)
     state = case.saved(store, 50, 90)
@@ -105,16 +105,16 @@ def test_a_restored_state_needs_no_new_compilation(case, tmp_path):
     assert case.sweep.advance._cache_size() == compiled
 
 
-def test_training_may_go_on_while_a_checkpoint_is_written(case, tmp_path):
+def test_training_continues_while_a_checkpoint_is_written(case, tmp_path):
     store = case.store(tmp_path)
     state = case.trained(60)
     store.save(state, position(60), LENGTHS)
-    case.sweep.advance(state, 20, True)  # donates the memory of what is being written
+    case.sweep.advance(state, 20, True)  # donates the memory of the arrays being written
     store.wait()
     assert same(store.restore(case.template).state, case.trained(60))
 
 
-def test_rows_are_written_once_and_only_those_that_are_filled(case, tmp_path):
+def test_only_filled_rows_are_written_and_each_once(case, tmp_path):
     store = case.store(tmp_path)
     case.saved(store, 45, 60)
     rows = sorted(store.path.glob("rows_*"))
@@ -124,7 +124,7 @@ def test_rows_are_written_once_and_only_those_that_are_filled(case, tmp_path):
     assert case.store(tmp_path).sizes(case.template)[1] == len(SEEDS) * width * 4
 
 
-def test_rows_go_to_the_disk_in_pieces(case, tmp_path, monkeypatch):
+def test_rows_are_written_in_pieces(case, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "PIECE_BYTES", 10 * len(SEEDS) * 6 * 4)
     store = case.store(tmp_path)
     state = case.saved(store, 60, 100)
@@ -182,7 +182,7 @@ def disk_is_full_for_the_manifest(monkeypatch):
     [disk_is_full_for_rows, disk_is_full_for_the_state, disk_is_full_for_the_manifest],
     ids=lambda f: f.__name__,
 )
-def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
+def test_a_full_disk_does_not_stop_training(case, tmp_path, fault):
     store = case.store(tmp_path)
     state = case.saved(store, 60)
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -194,7 +194,7 @@ def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
     assert "no checkpoint at step 70" in warning and "No space left" in warning
     assert "the last valid one is at step 60" in warning
     assert not [name for name in listing(store) if name.endswith(".part")]
-    # The older one is as good as before, and with room again there is a newer one.
+    # The older one is still valid, and with room again there is a newer one.
     state = case.sweep.advance(state, 10, True)
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(60))
     store = case.store(tmp_path)
@@ -204,7 +204,7 @@ def test_a_full_disk_is_no_reason_to_stop(case, tmp_path, fault):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(80))
 
 
-def test_room_that_comes_back_is_used_by_the_same_process(case, tmp_path):
+def test_freed_disk_space_is_used_by_the_same_process(case, tmp_path):
     store = case.store(tmp_path)
     state = case.saved(store, 60)
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -218,7 +218,7 @@ def test_room_that_comes_back_is_used_by_the_same_process(case, tmp_path):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(80))
 
 
-def test_a_resume_keeps_no_more_than_it_is_told_to(case, tmp_path):
+def test_a_resumed_run_keeps_as_many_checkpoints_as_the_flag_says(case, tmp_path):
     case.saved(case.store(tmp_path, keep=3), 50, 60, 130)
     store = case.store(tmp_path, keep=1)
     store.restore(case.template)
@@ -227,11 +227,11 @@ def test_a_resume_keeps_no_more_than_it_is_told_to(case, tmp_path):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(130))
 
 
-def test_where_nothing_was_saved_nothing_is_restored(case, tmp_path):
+def test_without_a_checkpoint_nothing_is_restored(case, tmp_path):
     assert case.store(tmp_path).restore(case.template) is None
 
 
-def test_what_a_dead_process_left_half_written_is_removed(case, tmp_path):
+def test_incomplete_files_of_a_dead_process_are_removed(case, tmp_path):
     store = case.store(tmp_path)
     state = case.saved(store, 60)
     (store.path / "step_0000000070.part" / "state").mkdir(parents=True)
@@ -241,13 +241,13 @@ def test_what_a_dead_process_left_half_written_is_removed(case, tmp_path):
     before = listing(store)
     store = case.store(tmp_path)
     assert same(store.restore(case.template).state, state)
-    assert listing(store) == before  # not before it is known that the run goes on
+    assert listing(store) == before  # nothing is removed before the run certainly resumes
     store.remove_others()
     assert listing(store) == ["notes.txt", "rows_0000000000_0000000060.bin", "step_0000000060"]
 
 
 def test_the_rows_of_older_checkpoints_outlive_a_resume(case, tmp_path):
-    """The ring goes round between the two: the later one does not need the first rows."""
+    """The ring overwrites rows between the two: the later one does not need the first rows."""
     case.saved(case.store(tmp_path), 60, 130)
     store = case.store(tmp_path)
     store.restore(case.template)
@@ -256,7 +256,7 @@ def test_the_rows_of_older_checkpoints_outlive_a_resume(case, tmp_path):
     assert same(case.store(tmp_path).restore(case.template).state, case.trained(60))
 
 
-def test_a_file_that_cannot_be_read_is_no_reason_to_give_a_checkpoint_up(case, tmp_path, monkeypatch):
+def test_a_checkpoint_is_kept_if_a_file_cannot_be_read_now(case, tmp_path, monkeypatch):
     store = case.store(tmp_path)
     case.saved(store, 50, 60)
     before = listing(store)
@@ -293,7 +293,7 @@ def test_a_step_is_saved_again_after_its_evaluation(case, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_environments_per_member_fill_the_ring_side_by_side(tmp_path):
+def test_several_environments_per_member_fill_the_ring_interleaved(tmp_path):
     case = Case(num_envs=4)
     state = case.saved(case.store(tmp_path), 48, 100)
     restored = case.store(tmp_path).restore(case.template)
@@ -304,7 +304,7 @@ def test_several_environments_per_member_fill_the_ring_side_by_side(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["td3", "td7"])
 def test_transitions_that_lost_their_final_observations_stay_lost(algo, tmp_path):
-    case = Case(algo, make_env=probe_envs.shorter_than_it_says)
+    case = Case(algo, make_env=probe_envs.shorter_than_stated)
     state = case.saved(case.store(tmp_path), 50, 130)
     assert np.all(case.replay.size(state.replay) == 1 + 64 / 8 + 1)  # the newest one's needs no room
     restored = case.store(tmp_path).restore(case.template)
@@ -323,7 +323,7 @@ def test_a_checkpoint_of_another_run_is_not_used(case, tmp_path):
 
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
 @pytest.mark.slow
-def test_members_come_back_on_any_devices_without_the_copies_that_filled_them(case, tmp_path):
+def test_members_are_restored_on_any_devices_without_padding(case, tmp_path):
     two = Case(devices=2)
     state = two.saved(two.store(tmp_path), 50, 90)
     assert state.replay.storage.shape[0] == 4
@@ -338,7 +338,7 @@ def test_members_come_back_on_any_devices_without_the_copies_that_filled_them(ca
     assert same(two.advance(again, 30, True), two.advance(state, 30, True))
 
 
-def test_keys_come_back_as_keys(case, tmp_path):
+def test_keys_are_restored_as_keys(case, tmp_path):
     store = case.store(tmp_path)
     case.saved(store, 50)
     key = store.restore(case.template).state.key
@@ -346,8 +346,8 @@ def test_keys_come_back_as_keys(case, tmp_path):
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(case.trained(40).key))
 
 
-def test_arrays_without_entries_come_back_too(case, tmp_path):
-    """Brax's environments carry some."""
+def test_empty_arrays_are_restored_too(case, tmp_path):
+    """Brax's environments have some."""
 
     def with_one(state):
         return state._replace(timestep=(state.timestep, jnp.zeros((len(SEEDS), 0, 2), jnp.int32)))

@@ -42,7 +42,7 @@ def finished(tmp_path_factory):
     return code, out / "ant" / "sac_sqt" / "run"
 
 
-def test_a_run_leaves_its_files(finished):
+def test_the_files_of_a_run(finished):
     code, path = finished
     assert code == 0
     names = {item.name for item in path.iterdir()}
@@ -52,8 +52,8 @@ def test_a_run_leaves_its_files(finished):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "released"])
-def test_td7_tells_of_its_checkpoints(preset, tmp_path):
-    """TD7's state and metrics are unlike the others': a whole run of it."""
+def test_td7_reports_its_policy_checkpoints(preset, tmp_path):
+    """TD7's state and metrics differ from the others': a complete run."""
     more = ("--algo=td7_sqt", "--embedding_size=8", f"--preset={preset}", "--policy_delay=2")
     assert run(tmp_path, *more) == 0
     path = tmp_path / "ant" / "td7_sqt" / "run"
@@ -61,7 +61,7 @@ def test_td7_tells_of_its_checkpoints(preset, tmp_path):
     assert len(evaluations) == 8 and all(np.isfinite(float(row["return_mean"])) for row in evaluations)
     assert evaluations[-1]["gradient_steps"] == ("180" if preset == "released" else "90")
     last = metrics[-1]
-    # Episodes of 5 steps from step 30 to 120; each is an assessment, and all returns are equal, which is good enough.
+    # Episodes of 5 steps from step 30 to 120; each is an assessment, and all returns are equal, which is never worse.
     assert (last["env_steps"], last["assessments"], last["policy_checkpoint_refreshes"]) == ("120", "18.0", "18.0")
     assert float(last["best_min_return"]) == float(last["train_return"])
 
@@ -104,7 +104,7 @@ def test_metrics_of_a_run(finished):
     assert [row["q_std"] for row in rows] == [row["q_std"] for row in evaluations]
 
 
-def test_settings_of_a_run_make_it_again(finished):
+def test_settings_of_a_run_repeat_it(finished):
     config = json.loads((finished[1] / "config.json").read_text())
     settings = config["settings"]
     assert {"algo": "sac_sqt", "env": "ant", "steps": 120, "hidden": [8, 8]}.items() <= settings.items()
@@ -147,7 +147,7 @@ def test_output_of_a_run(tmp_path, capsys):
     assert not (path / "tensorboard").exists()
 
 
-def test_quiet_says_nothing(tmp_path, capsys):
+def test_quiet_prints_nothing(tmp_path, capsys):
     assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 0
     assert capsys.readouterr() == ("", "")
 
@@ -177,13 +177,13 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
     assert [group["temperature"] for group in summary["groups"]] == [0.2, 1e38]
     assert summary["env_steps"] == 120
     assert "member 2 diverged" in capsys.readouterr().out
-    # What a diverged member returns says nothing: no row, mean or score counts it; those of the others stay.
+    # The returns of a diverged member are in no row, mean or score; those of the others stay.
     rows = rows_of(tmp_path / "ant" / "sac_sqt" / "run" / "evaluations.csv")
     late = [row for row in rows if row["env_steps"] != "0"]
     for column in ("return_mean", "q_mean", "q_std"):
         assert {row["member"] for row in late if row[column]} == {"0", "1"}
     assert [group["final"]["mean"] is None for group in summary["groups"]] == [False, True]
-    # The others do not notice: their rows are those of a run in which nobody diverges.
+    # The others continue: their rows are those of a run in which no member diverges.
     assert run(tmp_path / "good", "--temperature=0.2,0.3") == 0
     for name in ("evaluations.csv", "metrics.csv"):
         with_it, without = (rows_of(out / "ant" / "sac_sqt" / "run" / name) for out in (tmp_path, tmp_path / "good"))
@@ -193,7 +193,7 @@ def test_a_member_that_diverges_is_named_and_the_others_finish(tmp_path, capsys)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_keeps_what_it_has(tmp_path, monkeypatch, number):
+def test_an_interrupted_run_keeps_its_results_so_far(tmp_path, monkeypatch, number):
     def report(self, report, original=records.Records.report):
         original(self, report)
         if report.env_steps == 50:
@@ -210,7 +210,7 @@ def test_an_interrupted_run_keeps_what_it_has(tmp_path, monkeypatch, number):
     assert (path / "curves.png").exists()
 
 
-def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsys):
+def test_only_a_run_is_replaced_and_only_with_overwrite(tmp_path, capsys):
     path = tmp_path / "ant" / "sac_sqt" / "run"
     path.mkdir(parents=True)
     (path / "config.json").write_text("old")
@@ -227,7 +227,7 @@ def test_a_run_is_replaced_only_when_asked_and_only_if_it_is_one(tmp_path, capsy
     assert json.loads((path / "config.json").read_text())["settings"]["algo"] == "sac_sqt"
 
 
-def test_the_default_name_tells_the_settings_and_the_time(tmp_path):
+def test_the_default_name_has_the_settings_and_the_time(tmp_path):
     arguments = TINY.removesuffix(" --name=run").split()
     options = ["--penalty_coef=0,0.5", "--quiet", f"--out={tmp_path}"]
     assert main(["experiments.run", *arguments, *options]) == 0
@@ -251,7 +251,7 @@ def test_help_lists_every_group(capsys):
         assert words in out
 
 
-# What cannot be, and how the one line begins. The typing errors are in test_flags.
+# Invalid command lines, and how the error line begins. Typing errors are in test_flags.
 BAD = [
     ("--stepz=5", "--stepz: unknown flag; did you mean --steps?"),
     ("--steps=two\nlines", "--steps=two\\nlines: expects a whole number"),
@@ -281,7 +281,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "line"), BAD, ids=[arguments[:40] for arguments, _ in BAD])
-def test_bad_usage_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, line):
+def test_an_invalid_command_is_one_line_and_writes_nothing(tmp_path, capsys, arguments, line):
     # Spaces separate arguments; a newline belongs to one.
     assert run(tmp_path / "out", *arguments.split(" ")) == 2
     out, err = capsys.readouterr()
@@ -306,7 +306,7 @@ def test_physics_that_cannot_run_here_is_rejected(tmp_path, capsys, monkeypatch,
 
 
 def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
-    """It says that the run has ended: not before its policies and curves are there."""
+    """It says that the run has ended, so policies and curves are written before it."""
 
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -31,12 +31,12 @@ def test_several_seeds_are_trained_in_every_way(monkeypatch):
 
 def test_seeds_are_trained_in_full_rounds_and_a_round_of_the_rest():
     rates = {1: 10.0, 2: 8.0, 3: 6.0, 5: 4.0}  # steps a second of each process
-    # Five seeds make a step each: two rounds of two in 2/8 s, one alone in 1/10 s.
+    # Five seeds make a step each: two rounds of two in 2/8 s, then one in 1/10 s.
     assert compare.rate_of_all(5, 2, rates) == pytest.approx(5 / (0.25 + 0.1))
     assert compare.rate_of_all(5, 1, rates) == pytest.approx(10.0)
     assert compare.rate_of_all(5, 5, rates) == pytest.approx(20.0)
     assert compare.rate_of_all(4, 2, rates) == pytest.approx(16.0)
-    assert compare.rate_of_all(5, 3, rates) == pytest.approx(5 / (1 / 6 + 1 / 8))  # the rest is two side by side
+    assert compare.rate_of_all(5, 3, rates) == pytest.approx(5 / (1 / 6 + 1 / 8))  # the rest is two in parallel
 
 
 class Peer:
@@ -55,7 +55,7 @@ class Peer:
 
 
 def compared(monkeypatch, members, run=lambda steps: None):
-    """A peer against ours: a process alone makes 12 steps per second, several 10 each; ours 10 of all members."""
+    """A peer against ours: one process makes 12 steps per second, several 10 each; ours 10 of all members together."""
     runs = []
 
     def timed(run):
@@ -72,7 +72,7 @@ def compared(monkeypatch, members, run=lambda steps: None):
 
 
 def test_rates_are_of_all_seeds(monkeypatch):
-    """Theirs one after the other counts one seed, side by side all; ours all members."""
+    """The peer's rate counts one seed at a time, or all in parallel; ours counts all members."""
     rows, runs = compared(monkeypatch, 6)
     assert [(row.what, row.rate) for row in rows] == [
         ("td7 on ant, sqt_jax", 60.0),
@@ -82,7 +82,7 @@ def test_rates_are_of_all_seeds(monkeypatch):
     ]
     assert runs == [0, 1, 2, 4] and {row.members for row in rows} == {6}
     assert {row.unit for row in rows} == {"member updates"}
-    assert [row.compile_seconds for row in rows] == [0.5, None, None, None]  # of theirs it is not known
+    assert [row.compile_seconds for row in rows] == [0.5, None, None, None]  # not measured for the peer
 
 
 def test_processes_that_do_not_start_are_a_failure_and_the_others_are_measured(monkeypatch):
@@ -99,7 +99,7 @@ def test_processes_that_do_not_start_are_a_failure_and_the_others_are_measured(m
 
 
 @pytest.mark.parametrize(("backend", "device"), [("cpu", "cpu"), ("gpu", "cuda")])
-def test_pytorch_computes_where_we_do(monkeypatch, backend, device):
+def test_pytorch_uses_our_device(monkeypatch, backend, device):
     given = []
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(compare, "measure_cases", lambda cases, **timing: [case.prepare() for case in cases[1:]] and [])
@@ -108,7 +108,7 @@ def test_pytorch_computes_where_we_do(monkeypatch, backend, device):
     assert given == [["27", "8", device]]
 
 
-def test_ours_is_compared_with_the_best_of_theirs():
+def test_our_rate_is_compared_with_the_peers_best():
     def row(what, members, rate):
         return Measurement("compare", what, members, "env steps", rate, 0.0)
 

@@ -1,3 +1,5 @@
+"""Comparisons with baselines by hand: percentages, probabilities, intervals, footnotes."""
+
 import pytest
 from made_runs import write_run
 from table_reader import cells
@@ -57,7 +59,7 @@ def test_a_comparison_says_which_of_the_two_is_incomplete(tmp_path):
     assert table.notes == ["td3 on cheetah: seed 0 stopped at step 50 of 100"]
 
 
-def test_intervals_of_scores_and_no_others_are_said_to_leave_the_choice_out(tmp_path):
+def test_only_intervals_of_scores_have_the_note_on_the_choice(tmp_path):
     for algo in ("td3", "td3_sqt"):
         write_run(tmp_path, algo)
     runs = collect([str(tmp_path)])

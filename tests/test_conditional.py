@@ -58,8 +58,8 @@ def test_unbatched_arguments_are_shared():
     )
 
 
-def test_the_branch_is_one_in_the_compiled_loop():
-    """One conditional, and no select of the state outside of it."""
+def test_the_compiled_loop_has_a_real_branch():
+    """One conditional, and no select of the state outside."""
 
     def loop(old, given):
         def body(i, old):

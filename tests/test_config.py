@@ -1,4 +1,4 @@
-"""Defaults, limits and their messages, and the way of a configuration through a file."""
+"""Defaults, limits and their messages, and a configuration written to a file and read back."""
 
 import json
 import pickle
@@ -52,7 +52,7 @@ def user(settings):
     return next(a for a in ("sac_sqt", "td7_sqt", "redq_sqt", "sac") if all(has_effect(a, name) for name in settings))
 
 
-REFUSED = [
+REJECTED = [
     ("penalty_coef", {"penalty_coef": -0.1}),
     ("penalty_coef", {"penalty_coef": float("nan")}),
     ("penalty_coef", {"penalty_coef": float("inf")}),
@@ -126,8 +126,8 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("setting", "settings"), REFUSED, ids=str)
-def test_what_cannot_be_is_refused_by_its_name(setting, settings):
+@pytest.mark.parametrize(("setting", "settings"), REJECTED, ids=str)
+def test_invalid_settings_are_rejected_by_name(setting, settings):
     with pytest.raises(ConfigError) as error:
         make_config(user(settings), "ant", **settings)
     assert error.value.setting == setting
@@ -135,13 +135,13 @@ def test_what_cannot_be_is_refused_by_its_name(setting, settings):
     assert message.startswith((f"--{setting}: expects ", f"--{setting}: expected ")) and "\n" not in message
 
 
-def test_every_limited_setting_is_among_the_refused():
+def test_every_limited_setting_is_among_the_rejected():
     assert set(SETTINGS) - {"eval_physics", "squashed_log_prob"} <= {
-        name for _, settings in REFUSED for name in settings
+        name for _, settings in REJECTED for name in settings
     }
 
 
-def test_every_setting_says_what_it_is_and_expects():
+def test_every_setting_has_help_and_says_what_it_expects():
     for name, about in SETTINGS.items():
         assert about.help and about.expects(), name
         assert set(about.features) <= set(FEATURES), name
@@ -152,7 +152,7 @@ def test_every_setting_says_what_it_is_and_expects():
 @pytest.mark.parametrize(
     "settings",
     [
-        {"penalty_coef": 0},  # an int where a number is taken
+        {"penalty_coef": 0},  # an int where a number is expected
         {"gamma": 1.0, "tau": 1.0, "temperature": 0.0, "warmup_steps": 0},
         {"ddof": 0},
         {"ensemble_size": 10, "reduce": "subset_min", "updates_per_step": 5},
@@ -167,23 +167,23 @@ def test_every_setting_says_what_it_is_and_expects():
     ],
     ids=str,
 )
-def test_the_edges_of_the_limits_are_taken(settings):
+def test_the_edges_of_the_limits_are_accepted(settings):
     flat = make_config(user(settings), "ant", **settings).flat()
     assert {name: flat[name] for name in settings} == settings
 
 
-def test_a_plain_algorithm_takes_no_penalty():
+def test_a_baseline_accepts_no_penalty():
     with pytest.raises(ConfigError, match="--penalty_coef: has no effect with td3$"):
         make_config("td3", "ant", penalty_coef=0.5)
     assert make_config("td3", "ant", penalty_coef=0).agent.penalty_coef == 0
 
 
-def test_a_plain_algorithms_ddof_is_that_of_the_disagreement_it_reports():
+def test_a_baselines_ddof_is_that_of_the_disagreement_it_reports():
     with pytest.raises(ConfigError, match="--ddof: expects a number below the ensemble_size .2."):
         make_config("td3", "ant", ddof=2)
 
 
-def test_a_plain_algorithm_may_have_one_critic():
+def test_a_baseline_may_have_one_critic():
     assert make_config("td3", "ant", ensemble_size=1).agent.ensemble_size == 1
 
 
@@ -199,7 +199,7 @@ def test_a_plain_algorithm_may_have_one_critic():
         ("td7_sqt", {"temperature": 0.1}),
     ],
 )
-def test_a_setting_without_effect_is_refused_and_its_default_is_taken(algo, settings):
+def test_a_setting_without_effect_is_rejected_and_its_default_accepted(algo, settings):
     (name,) = settings
     with pytest.raises(ConfigError, match=f"--{name}: has no effect with {algo}$"):
         make_config(algo, "ant", **settings)
@@ -216,7 +216,7 @@ def test_a_setting_without_effect_is_refused_and_its_default_is_taken(algo, sett
         ("sale", {"tau": 0.01}),
     ],
 )
-def test_a_setting_without_effect_on_these_networks_is_refused(networks, settings):
+def test_a_setting_without_effect_on_these_networks_is_rejected(networks, settings):
     (name,) = settings
     with pytest.raises(ConfigError, match=f"--{name}: has no effect with --networks={networks}$"):
         make_config("sac_sqt", "ant", networks=networks, **settings)
@@ -234,7 +234,7 @@ def test_redqs_actor_is_updated_once_per_environment_step():
     assert make_config("sac", "ant", updates_per_step=20).agent.policy_delay == 1
 
 
-def test_an_environment_of_ones_own_is_recorded_under_its_name():
+def test_a_custom_environment_is_recorded_under_its_name():
     env = probe_envs.one_step()
     config = make_config("td3", env)
     assert (config.env, config.physics, config.eval_physics) == (env.name, "own", "own")
@@ -250,7 +250,7 @@ def test_the_temperature_is_fixed_with_sale_networks():
         make_config("sac", "ant", networks="sale", learn_temperature=True)
 
 
-def test_a_learned_temperature_is_refused_by_the_flags_name():
+def test_a_learned_temperature_is_rejected_by_the_flags_name():
     with pytest.raises(ConfigError, match="--temperature: has no effect with td3"):
         make_config("td3", "ant", learn_temperature=True)
 
@@ -318,7 +318,7 @@ def test_no_setting_has_two_owners():
     ],
     ids=str,
 )
-def test_the_replay_is_no_larger_than_the_run_and_whole_inserts_fit(settings, capacity):
+def test_the_replay_is_no_larger_than_the_run_and_a_multiple_of_an_insert(settings, capacity):
     assert make_config("td3", "ant", **settings).train.capacity == capacity
 
 
@@ -336,6 +336,6 @@ def test_scalars_are_the_settings_of_their_names():
     assert [round(float(value), 6) for value in arrays] == list(expected)
 
 
-def test_an_error_reaches_another_process_whole():
+def test_an_error_reaches_another_process_complete():
     error = pickle.loads(pickle.dumps(ConfigError("steps", "expects a whole number")))
     assert (type(error), error.setting, str(error)) == (ConfigError, "steps", "--steps: expects a whole number")

@@ -1,4 +1,4 @@
-"""A file of settings is the command line that it stands for, or is rejected (hostile files: test_bad_input.py)."""
+"""A file of settings becomes the same command line, or is rejected (hostile files: test_bad_input.py)."""
 
 import pytest
 
@@ -30,7 +30,7 @@ def test_lines_are_arguments(tmp_path):
         ("steps", "expects lines like `steps: 100000`"),
     ],
 )
-def test_others_are_rejected(tmp_path, text, message):
+def test_other_files_are_rejected(tmp_path, text, message):
     path = tmp_path / "flags.yaml"
     path.write_text(text)
     with pytest.raises(config_file.InvalidConfigFile) as error:

@@ -1,4 +1,4 @@
-"""The critics' loss by hand, and what its gradient pushes towards. The update: test_agents."""
+"""The critics' loss and its gradient by hand. The update: test_agents."""
 
 import jax
 import jax.numpy as jnp

@@ -56,7 +56,7 @@ def test_rows_wait_while_the_disk_is_full_and_none_is_written_in_part(path, disk
     assert path.read_text() == before + "2,2\n3,3\n4,4\n"
 
 
-def test_of_an_existing_file_what_is_to_be_kept_stays(path):
+def test_an_existing_file_keeps_the_given_number_of_bytes(path):
     path.write_text(HEADER + "1,1\n2,2\n")
     table = CsvTable(path, len(HEADER + "1,1\n"), COLUMNS)
     assert path.read_text() == HEADER + "1,1\n"
@@ -66,7 +66,7 @@ def test_of_an_existing_file_what_is_to_be_kept_stays(path):
     assert path.read_text() == HEADER
 
 
-def test_a_file_that_has_lost_rows_or_has_other_columns_is_left_as_it_is(path):
+def test_a_file_with_lost_rows_or_other_columns_is_not_changed(path):
     path.write_text(HEADER + "1,1\n")
     with pytest.raises(MissingRows, match="^table.csv$"):
         CsvTable(path, 100, COLUMNS)

@@ -46,9 +46,9 @@ def test_other_episodes_are_detected():
 
 
 def test_the_tables_have_a_row_for_every_task():
-    starts = distributions.Starts(10, 0.1, 0.02, 0.0, 1.0)
+    starts = distributions.StartComparison(10, 0.1, 0.02, 0.0, 1.0)
     lengths = jax.numpy.array([10.0, 20.0])
-    played = distributions.Episodes(2, lengths, lengths + 1, 0.5, 0.25)
+    played = distributions.EpisodeComparison(2, lengths, lengths + 1, 0.5, 0.25)
     assert distributions.start_table(dict.fromkeys(TASKS, starts))[2:] == [
         f"| {task.gymnasium_id} | 10 | 0.100 | 0.020 | 0.000 | 1.00 |" for task in TASKS.values()
     ]

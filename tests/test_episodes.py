@@ -38,7 +38,7 @@ def test_each_episode_runs_to_its_own_end_and_shows_its_own_states():
     lengths = [int(episode.shown[1][0, 0]) for episode in played]
     assert [episode.length for episode in played] == lengths and len(set(lengths)) > 2
     for episode, length in zip(played, lengths, strict=True):
-        # the states in which the policy acted: the first, and none of the episode after it
+        # the states in which the policy acted: the first, and none of the next episode
         np.testing.assert_array_equal(episode.shown[0], np.arange(length))
         assert (episode.shown[1] == length).all()
         assert episode.total == length * (length + 1) / 2

@@ -52,7 +52,7 @@ def test_truncated_episodes():
     np.testing.assert_array_equal(result.lengths, [5, 5, 5, 5])
 
 
-def test_each_episode_counts_to_its_own_end_and_no_further():
+def test_each_episode_counts_up_to_its_own_end():
     env = random_lengths()
     lengths = np.asarray(rollout.reset(env, KEY, 16).obs)[:, 0]
     assert len(set(lengths)) > 3
@@ -83,7 +83,7 @@ def test_speeds_are_measured_next_to_the_bias():
         np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-def test_without_speed_in_the_environment_speeds_are_nan():
+def test_speeds_are_nan_if_the_environment_has_no_speed():
     result = run(constant_reward(5))
     assert result.speeds.shape == (4,) and np.isnan(result.speeds).all()
 
@@ -105,7 +105,7 @@ def test_a_key_repeats_an_evaluation_and_another_gives_other_starts():
     assert not np.any(first == other)
 
 
-def test_members_evaluate_side_by_side_as_they_do_alone():
+def test_members_evaluate_in_a_sweep_as_they_do_alone():
     keys = jax.random.split(KEY, 3)
     env = random_lengths()
     together = jax.jit(jax.vmap(lambda key: evaluate(env, zeros, key, 4)))(keys)
@@ -115,8 +115,8 @@ def test_members_evaluate_side_by_side_as_they_do_alone():
         np.testing.assert_array_equal(together.returns[i], alone(keys[i]).returns)
 
 
-def test_a_policy_is_worth_the_same_in_gymnasiums_environment_and_in_ours():
-    """A policy under which the hopper falls at once, whatever the start: lengths and returns lie close together."""
+def test_a_policy_has_the_same_return_in_gymnasiums_environment_and_in_ours():
+    """A policy under which the hopper falls at once, from any start: lengths and returns hardly vary."""
     import gymnasium
 
     weights = 0.3 * jax.random.normal(jax.random.key(1), (11, 3))
@@ -136,7 +136,7 @@ def test_a_policy_is_worth_the_same_in_gymnasiums_environment_and_in_ours():
 
 
 class Ladder:
-    """In Gymnasium's form: reward is the action as the environment sees it, 3 steps, actions from 0 to 10."""
+    """With Gymnasium's interface: the reward is the action that the environment gets, 3 steps, actions from 0 to 10."""
 
     class action_space:
         low, high = np.zeros(1, np.float32), np.full(1, 10, np.float32)
@@ -150,7 +150,7 @@ class Ladder:
         return np.zeros(1), float(action[0]), False, self.steps == 3, {}
 
 
-def test_actions_are_stretched_to_gymnasiums_action_space():
+def test_actions_are_scaled_to_gymnasiums_action_space():
     returns, lengths = evaluate_policy(lambda obs: 2 * obs[:, :1], Ladder(), num_episodes=2, seed=0)
     np.testing.assert_allclose(returns, [15, 20])  # obs 0, then 0 and 0: 5 each; obs 1: 10 and no more, then 5 and 5
     np.testing.assert_array_equal(lengths, [3, 3])

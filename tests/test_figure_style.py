@@ -1,3 +1,5 @@
+"""Colours, lines and panels of figures."""
+
 import numpy as np
 from figure_reader import legend_of, panels
 from made_runs import write_run
@@ -28,7 +30,7 @@ def test_every_algorithm_has_a_colour_and_a_line_of_its_own():
         assert shades == sorted(shades) and np.diff(shades).min() > 0.08
 
 
-def test_a_row_has_the_same_style_whatever_stands_beside_it(tmp_path):
+def test_a_row_has_the_same_style_whatever_the_other_rows_are(tmp_path):
     write_run(tmp_path / "a", "sac_sqt")
     write_run(tmp_path / "b", "td3")
     both, one = collect([str(tmp_path)]), collect([str(tmp_path / "a")])
@@ -55,7 +57,7 @@ def test_few_algorithms_share_a_panel_per_task_and_many_have_one_per_baseline(tm
     assert [axes.get_title() for axes in panels(few)] == ["cheetah", "ant"] and len(legend_of(few)) == 6
 
 
-def test_many_tasks_go_on_in_the_next_row(tmp_path):
+def test_many_tasks_are_wrapped_into_rows(tmp_path):
     for env in ("cheetah", "walker", "ant", "humanoid", "hopper"):
         write_run(tmp_path, env=env)
     figure = finished(collect([str(tmp_path)]))

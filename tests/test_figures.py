@@ -1,3 +1,5 @@
+"""Figures show the numbers of the runs: curves, bands, sweeps, profiles."""
+
 import numpy as np
 import pytest
 from figure_reader import legend_of, panels, pixels_of
@@ -53,7 +55,7 @@ def test_short_and_broken_curves_are_drawn_without_complaint(tmp_path, curves, r
     assert not recwarn.list
 
 
-def test_a_member_that_is_an_evaluation_short_is_drawn(tmp_path):
+def test_a_member_that_lacks_an_evaluation_is_drawn(tmp_path):
     table = table_of([[0, 1, 2], [1, 2, 3]], [0.1, 0.1])
     draw_curves({name: column[:-1] for name, column in table.items()}, tmp_path / "curves.png", "td3 on ant")
     assert pixels_of(imread(tmp_path / "curves.png"), COLOURS[0]) > 500
@@ -73,7 +75,7 @@ def test_a_curve_is_the_statistic_at_each_evaluation_and_its_band_the_interval(t
     assert {"iqm": "interquartile mean", "mean": "mean"}[statistic] in figure.get_suptitle()
 
 
-def test_a_seed_alone_has_no_band_and_a_diverged_one_ends_the_line(tmp_path):
+def test_a_single_seed_has_no_band_and_a_diverged_one_ends_the_line(tmp_path):
     write_run(tmp_path / "a", "td3")
     write_run(tmp_path / "b", "sac", curves=[[0, 1, 2], [0, 1, NAN]])
     figure = over_time(collect([str(tmp_path)]), "return_mean", "iqm")
@@ -85,7 +87,7 @@ def test_a_seed_alone_has_no_band_and_a_diverged_one_ends_the_line(tmp_path):
     assert "* sac on cheetah: seed 1 diverged after step 50" in figure.get_supxlabel()
 
 
-def test_what_was_not_measured_has_no_figure(tmp_path):
+def test_a_quantity_that_was_not_measured_has_no_figure(tmp_path):
     write_run(tmp_path / "a", "td3", more={"value_bias": [[NAN, 2, 3]]})
     write_run(tmp_path / "b", "sac")
     runs = collect([str(tmp_path)])
@@ -118,14 +120,14 @@ def test_sweeps_of_one_baseline_draw_it_once(tmp_path):
 
 
 @pytest.mark.parametrize("other", [{"steps": 200}, {"tau": 0.1}])
-def test_coefficients_of_runs_that_differ_otherwise_are_no_sweep(tmp_path, other):
+def test_runs_that_differ_in_more_than_the_coefficient_are_no_sweep(tmp_path, other):
     write_run(tmp_path / "a", "td3_sqt", penalty_coef=0.1)
     write_run(tmp_path / "b", "td3_sqt", penalty_coef=0.5, **other)
     assert penalty_sweep(collect([str(tmp_path)]), "mean") is None
 
 
 def test_profile_by_hand(tmp_path):
-    # Against the best mean, 10: half of td3's seeds lie above 0.5, and half of sac's above 1.
+    # Against the best mean, 10: half of td3's seeds are above 0.5, and half of sac's above 1.
     write_run(tmp_path, "td3", curves=[[0, 0, 4], [0, 0, 8]])
     write_run(tmp_path, "sac", curves=[[0, 0, 5], [0, 0, 15]])
     write_run(tmp_path, "td7", curves=[[NAN, NAN, NAN]])
@@ -150,7 +152,7 @@ def test_a_profile_has_a_band_only_where_all_its_tasks_have_several_seeds(tmp_pa
     assert len(axes.collections) == 1
 
 
-def test_a_profile_of_nothing(tmp_path):
+def test_a_profile_without_scores(tmp_path):
     write_run(tmp_path, curves=[[-3, -2, -1]])
     assert figures.performance_profile(collect([str(tmp_path)])) is None
 
@@ -162,7 +164,7 @@ def test_images(tmp_path, kind, start):
     assert figures.image(figure, kind).startswith(start)
 
 
-def test_every_figure_is_drawn_and_takes_no_text_for_a_formula(tmp_path):
+def test_every_figure_is_drawn_and_no_text_is_read_as_a_formula(tmp_path):
     write_run(tmp_path / "a", "td3", curves=[[0, 1, 2]], seeds=[0])
     write_run(tmp_path / "b", "td3", curves=[[0, 1, 3]], seeds=[1], versions={"jax": r"$\frac{"})
     draw = figures.all_figures(collect([str(tmp_path)]), "iqm")

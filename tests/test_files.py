@@ -1,4 +1,4 @@
-"""Files that are whole or not there, folders that one process writes, and reading what may be damaged."""
+"""Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def holder(tmp_path):
         process.kill()
 
 
-def test_a_folder_is_one_processs_until_it_dies(tmp_path, holder):
+def test_a_folder_is_locked_until_its_process_dies(tmp_path, holder):
     with pytest.raises(files.Busy) as busy, files.locked(tmp_path / "run"):
         pass
     assert busy.value.process == str(holder.pid)
@@ -42,7 +42,7 @@ def test_a_folder_is_one_processs_until_it_dies(tmp_path, holder):
         assert (tmp_path / "run" / "lock").read_text() == f"{os.getpid()}\n"
 
 
-def test_a_lock_is_given_back(tmp_path):
+def test_a_lock_is_released(tmp_path):
     with pytest.raises(KeyError), files.locked(tmp_path):
         with pytest.raises(files.Busy), files.locked(tmp_path):  # not twice in one process either
             pass
@@ -60,7 +60,7 @@ def test_a_lock_that_is_a_link_is_not_written_through(tmp_path):
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def test_a_file_gets_its_name_when_it_is_whole(tmp_path):
+def test_a_file_gets_its_name_when_it_is_complete(tmp_path):
     path = tmp_path / "file"
     path.write_text("old")
     with files.atomic_file(path) as file:
@@ -140,7 +140,7 @@ def test_json_is_read_up_to_its_limits(tmp_path):
     ],
     ids=lambda content: repr(content)[1:12],
 )
-def test_what_is_no_plain_json_is_rejected(tmp_path, content):
+def test_invalid_json_is_rejected(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(ValueError):
         files.read_json(tmp_path / "file", 1_000_000)

@@ -15,12 +15,12 @@ from experiments.playing.film_formats import FORMATS
 from sqt_jax.envs.gym_table import TASKS
 from sqt_jax.envs.gym_tasks import load_model
 
-HEIGHT, WIDTH = 34, 50  # even, and not the multiples of 16 that encoders like best
+HEIGHT, WIDTH = 34, 50  # even, and not multiples of 16, which encoders prefer
 PERIODS = {load_model(task).opt.timestep * task.frame_skip for task in TASKS.values()}
 
 
 def pictures(count=12):
-    """A white bar that walks to the right, on a ground whose colour changes."""
+    """A white bar that moves to the right, on a background whose colour changes."""
     for number in range(count):
         picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         picture[:] = 20 * number, 60, 200 - 10 * number
@@ -29,7 +29,7 @@ def pictures(count=12):
 
 
 def decoded(path):
-    """What ffmpeg says of a film, and its pictures."""
+    """ffmpeg's text about a film, and its pictures."""
     # not by imageio_ffmpeg.read_frames, which forks
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     done = subprocess.run(command, capture_output=True, check=True)
@@ -79,7 +79,7 @@ def test_films_of_every_task_run_in_real_time(period):
     assert films.stride(0.05, "mp4") == 1 and films.stride(0.008, "mp4") == 3 and films.stride(0.008, "gif") == 5
 
 
-def test_periods_without_an_exact_multiple():
+def test_strides_of_periods_without_an_exact_multiple():
     assert films.stride(1 / 30, "gif") == 3 and films.stride(1 / 64, "mp4") == 2
     assert films.stride(0.0123457, "gif") == 2  # nearly
 
@@ -89,14 +89,14 @@ def test_periods_without_an_exact_multiple():
     ("frames", "says"),
     [([], "needs a picture"), ([np.zeros((34, 51, 3), np.uint8)], "even numbers of pixels, not 51x34")],
 )
-def test_pictures_that_cannot_be_a_film(name, frames, says):
+def test_pictures_that_make_no_film_are_rejected(name, frames, says):
     with pytest.raises(ValueError, match=says):
         films.encode(frames, 0.05, name)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
-def test_a_film_that_is_not_finished_leaves_the_old_one(tmp_path, suffix, error):
+def test_an_unfinished_film_does_not_replace_the_old_one(tmp_path, suffix, error):
     path = tmp_path / f"film.{suffix}"
     path.write_text("old")
 

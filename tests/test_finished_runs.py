@@ -1,3 +1,5 @@
+"""Finding runs below folders, and reading their files."""
+
 import json
 import shutil
 
@@ -23,7 +25,7 @@ def test_folders_with_evaluations_only_are_named(tmp_path):
     assert find([str(tmp_path)]) == ([one], [f"left out: {two} has an evaluations.csv but no config.json"])
 
 
-def test_folders_in_which_there_is_no_run_are_named(tmp_path):
+def test_folders_without_a_run_are_named(tmp_path):
     path = write_run(tmp_path / "a")
     for text, message in [
         (str(tmp_path / "none"), "does not exist; RUNS expects folders of runs or folders above them"),
@@ -37,7 +39,7 @@ def test_folders_in_which_there_is_no_run_are_named(tmp_path):
         find([str(tmp_path / "empty")])
 
 
-def test_a_line_that_was_cut_off_is_no_row(tmp_path):
+def test_an_incomplete_last_line_is_dropped(tmp_path):
     path = write_run(tmp_path, curves=[[0, 1, 2]])
     table = path / "evaluations.csv"
     table.write_text(table.read_text().rstrip("\n")[:-3])
@@ -75,7 +77,7 @@ def test_damaged_evaluations_are_named(tmp_path, damage, message):
 
 
 @pytest.mark.parametrize("value", ["<script>", "warp drive", 3, ["mjx"], ""])
-def test_a_physics_that_cannot_have_evaluated_is_rejected(tmp_path, value):
+def test_an_impossible_physics_of_the_evaluation_is_rejected(tmp_path, value):
     path = write_run(tmp_path)
     content = json.loads((path / "config.json").read_text()) | {"evaluated_on": value}
     (path / "config.json").write_text(json.dumps(content))

@@ -48,7 +48,7 @@ def test_defaults_are_shown_as_the_algorithms_rows_have_them(algo):
 
 
 def _names(algo):
-    """What a default may call an algorithm: its name, its baseline, its ending."""
+    """The names that a default's text may use for an algorithm: its name, its baseline, its ending."""
     baseline = ALGORITHMS[algo].baseline or algo
     return {algo, baseline, algo.removeprefix(baseline)}
 

@@ -1,3 +1,5 @@
+"""The command line as `Options`: types, defaults, sweeps, files of flags, error lines."""
+
 import os
 import subprocess
 import sys
@@ -86,7 +88,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("argument", BAD)
-def test_bad_arguments_are_named_with_what_they_take(argument):
+def test_invalid_arguments_are_named_with_what_they_expect(argument):
     with pytest.raises(flags.UsageError) as error:
         parse(argument)
     assert str(error.value) == BAD[argument]
@@ -100,7 +102,7 @@ def test_algorithm_and_environment_are_required(missing):
 
 
 @pytest.mark.parametrize("word", ["--help", "-h"])
-def test_help_wins_over_everything_else(word):
+def test_help_overrides_everything_else(word):
     assert flags.parse(["run", "--stepz=5", word]) is None
 
 
@@ -168,7 +170,7 @@ def test_a_file_gives_flags_and_the_command_line_wins(tmp_path):
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
+def test_an_invalid_file_is_rejected_in_one_line(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(flags.UsageError) as error:
         flags.parse(["run", f"--config={path}", "--algo=td3", "--env=ant"])
@@ -176,7 +178,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
     assert message in line and "\n" not in line
 
 
-def test_what_is_no_file_is_refused(tmp_path):
+def test_a_path_that_is_no_file_is_rejected(tmp_path):
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     cases = {tmp_path: "which this is not", tmp_path / "none.yaml": "no such file", fifo: "which this is not"}

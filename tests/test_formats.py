@@ -1,3 +1,5 @@
+"""Result tables as Markdown, CSV, LaTeX and text."""
+
 import csv
 import io
 import re
@@ -35,7 +37,7 @@ def test_markdown():
     )
 
 
-def test_csv_has_the_full_numbers_and_leaves_out_what_is_not_known():
+def test_csv_has_the_full_numbers_and_empty_fields_for_unknown_ones():
     assert comma_separated(TABLE) == 'algo,mean,std,source\ntd3_sqt,-4275.25,,\ntd3,,,"a, b"\n'
     assert len(list(csv.DictReader(io.StringIO(comma_separated(TABLE))))) == 2
 

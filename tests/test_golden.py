@@ -1,6 +1,6 @@
 """Exact update traces of an independent PyTorch implementation (tests/data/golden/README.md).
 
-Sizes and settings are read from each file; `SQT_GOLDEN_DIR` names another folder of such files.
+Sizes and settings are read from each file; `SQT_GOLDEN_DIR` names another folder of traces.
 """
 
 import os
@@ -64,7 +64,7 @@ def build(arrays: dict, name: str, **changes):
     settings["ensemble_size"] = kernels[0].shape[0]
     if "encoder" in nets:
         settings["embedding_size"] = nets["encoder"]["state2"]["bias"].shape[0]
-        kernels = kernels[1:]  # layer0 lies before the embeddings
+        kernels = kernels[1:]  # layer0 comes before the embeddings
     config = AgentConfig(hidden=tuple(k.shape[-1] for k in kernels[:-1]), **settings)
     parts = make_parts(algo, config, batch["obs"].shape[-1], batch["action"].shape[-1])
     state = parts.agent.init(jax.random.key(0))
@@ -104,7 +104,7 @@ def replay_trace(arrays: dict, name: str, **changes):
     def compare(name, ours, theirs):
         theirs = np.asarray(theirs)
         excess = np.abs(np.asarray(ours) - theirs) / (TOLERANCE["atol"] + TOLERANCE["rtol"] * np.abs(theirs))
-        largest = float(np.nan_to_num(excess, nan=np.inf).max())  # of a NaN Python's max would keep the other one
+        largest = float(np.nan_to_num(excess, nan=np.inf).max())  # Python's max would drop a NaN
         deviation[name] = max(deviation.get(name, 0.0), largest)
 
     for k in range(batch["obs"].shape[0]):
@@ -134,7 +134,7 @@ def test_every_update_agrees_with_the_trace(path):
 
 
 def needed(name: str) -> set[str]:
-    """What a file of this name is to be compared in, at least."""
+    """The quantities in which a file of this name has to be compared, at least."""
     base, variant = name.removeprefix("released_").split("_", 1)
     keys = {"trace/td_target", "final/critic", "final/target_critic", "final/actor", "final/target_actor"}
     if variant != "plain":
@@ -197,7 +197,7 @@ def test_sizes_and_settings_are_those_of_the_file(name, tmp_path):
     assert max(deviation.values()) < 0.1
 
 
-def test_a_number_that_is_none_agrees_with_nothing(monkeypatch):
+def test_a_nan_agrees_with_nothing(monkeypatch):
     name = "td3_sqt"
     arrays = dict(np.load(DATA / f"{name}.npz"))
     monkeypatch.setattr(lap, "priority", lambda *_: jnp.nan)
@@ -251,6 +251,6 @@ FAULTS += [slow(name, fault) for name, faults in RELEASED.items() for fault in f
 @pytest.mark.parametrize(("name", "fault"), FAULTS, ids=str)
 def test_the_traces_notice_a_wrong_formula(name, fault):
     arrays = dict(np.load(DATA / f"{name}.npz"))
-    if fault == {"sampled_actor": False}:  # the deterministic actor has no such head
+    if fault == {"sampled_actor": False}:  # the deterministic actor has no log_std head
         arrays = {key: value for key, value in arrays.items() if "/log_std/" not in key}
     assert max(replay_trace(arrays, name, **fault).values()) > 30

@@ -25,7 +25,7 @@ DISPLAY = {"DISPLAY": ":0"}
         ({}, "darwin", {""}, "", [""]),
     ],
 )
-def test_the_first_that_works_is_chosen(environment, platform, working, chosen, asked):
+def test_the_first_implementation_that_works_is_chosen(environment, platform, working, chosen, asked):
     tried = []
     assert choose(environment, platform, lambda name: tried.append(name) or name in working) == chosen
     assert tried == asked
@@ -55,7 +55,7 @@ def test_displays():
     assert not has_display({}, "linux") and not has_display({"DISPLAY": ""}, "linux")
 
 
-def test_an_attempt_that_fails_or_hangs_is_no(monkeypatch):
+def test_an_attempt_that_fails_or_hangs_counts_as_failed(monkeypatch):
     before = dict(os.environ)
     assert not graphics.works("nonsense")
     assert dict(os.environ) == before

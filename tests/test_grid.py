@@ -25,12 +25,12 @@ def test_tables_2_to_4_are_the_papers_nine_on_its_four_tasks():
     assert len({algo for algo, _ in of("all")}) == 9 and len(of("all")) == 36
 
 
-def test_an_ordinary_cell_is_called_by_its_flags():
+def test_a_cell_is_named_by_its_flags():
     assert run_name(["--steps=10", "--hidden=8,8", "--out=a/b"]) == "hidden=8,8_out=a-b_steps=10"
     assert run_name([]) == "default"
 
 
-def test_names_that_are_cut_tell_cells_apart():
+def test_shortened_names_still_differ():
     common = [f"--seeds={','.join(map(str, range(100)))}"]
     one, other = (run_name([*common, f"--steps={steps}"]) for steps in (100, 200))
     assert one != other == run_name([*common, "--steps=200"]) and len(one) == len(other) == 200
@@ -50,6 +50,6 @@ def test_an_unknown_grid_is_rejected(name):
 
 
 @pytest.mark.parametrize("word", ["--env=ant", "--resume", "ant", "-steps=5"])
-def test_flags_that_each_cell_has_its_own_value_of_are_rejected(word):
+def test_flags_that_the_grid_sets_are_rejected(word):
     with pytest.raises(UsageError, match=f"^{word}: expects flags of experiments.run in the form --flag=value, exc"):
         make_cells("table2", [], [], Path("runs"), [word])

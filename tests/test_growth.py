@@ -12,7 +12,7 @@ def row(point, rate):
 
 
 def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
-    """And each line is measured interleaved."""
+    """The points of each line are measured interleaved."""
     made, lines = [], []
 
     def measure_cases(cases, **timing):
@@ -42,7 +42,7 @@ def test_members_critics_and_capacity_are_varied_one_at_a_time(monkeypatch):
     )
 
 
-def test_a_figure_shows_the_time_of_one_at_every_point(tmp_path, monkeypatch):
+def test_a_figure_shows_the_time_of_one_member_at_every_point(tmp_path, monkeypatch):
     shown = []
     monkeypatch.setattr(growth, "_draw", lambda points, x, y, path: shown.append((points, path.name)))
     rows = [row(("members", "td3", 1), 100.0), row(("members", "td3", 5), 250.0), row(("capacity", "lap", 10), 1e6)]
@@ -61,6 +61,6 @@ def test_figures_are_pictures_with_every_value_on_the_axis(tmp_path):
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def test_what_did_not_grow_is_not_drawn(tmp_path):
+def test_quantities_that_were_not_varied_are_not_drawn(tmp_path):
     assert growth.draw([Measurement("env", "", 5, "env steps", 1.0, 0.0)], tmp_path / "none") == []
     assert not (tmp_path / "none").exists()

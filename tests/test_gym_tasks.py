@@ -1,4 +1,4 @@
-"""The pieces of the locomotion tasks by hand; whole steps are compared in test_gymnasium_parity."""
+"""The parts of the locomotion tasks by hand; complete steps are compared in test_gymnasium_parity."""
 
 import itertools
 import sys
@@ -111,7 +111,7 @@ def test_starts_have_gymnasiums_distribution(name):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_actions_are_stretched_to_the_actuators_range(name, recording_physics):
+def test_actions_are_scaled_to_the_actuators_range(name, recording_physics):
     limit = 0.4 if name.startswith("humanoid") else 1.0
     env = envs.make(name, physics="recording")
     action = jnp.linspace(-1, 1, env.action_size)
@@ -119,12 +119,12 @@ def test_actions_are_stretched_to_the_actuators_range(name, recording_physics):
     np.testing.assert_allclose(timestep.state.task.internal, limit * action, rtol=1e-6)
     expected = TASKS[name].alive - TASKS[name].ctrl_cost * np.sum((limit * np.asarray(action)) ** 2)
     expected += TASKS[name].height * float(timestep.state.task.qpos[2])
-    np.testing.assert_allclose(timestep.reward, expected, rtol=1e-5)  # the cost is that of the stretched action
+    np.testing.assert_allclose(timestep.reward, expected, rtol=1e-5)  # the cost is that of the scaled action
     excess = env.step(env.reset(jax.random.key(0)), 5 * jnp.ones(env.action_size))
     np.testing.assert_allclose(excess.state.task.internal, limit, rtol=1e-6)
 
 
-def test_a_tasks_options_reach_its_physics_and_give_way_to_the_callers(monkeypatch):
+def test_a_tasks_options_reach_its_physics_and_the_callers_override_them(monkeypatch):
     seen = []
 
     def make_physics(name, setup, **options):
@@ -184,7 +184,7 @@ def test_no_constant_action_at_its_limits_makes_a_robot_fall_sooner_than_the_rep
         lengths[tuple(corner)] = steps / 3
     shortest = min(lengths.values())
     assert shortest >= MIN_STEPS_TO_FALL
-    assert name not in ("hopper", "walker") or shortest < 7  # it is a tight one
+    assert name not in ("hopper", "walker") or shortest < 7  # the bound is tight
 
 
 @pytest.mark.parametrize("name", ["cheetah", "walker", "ant", "hopper", "swimmer"])

@@ -35,7 +35,7 @@ LARGE = ("humanoid", "humanoid_standup", "humanoid-v5", "humanoid_standup-v5", "
 
 @pytest.mark.parametrize("name", [pytest.param(t, marks=pytest.mark.slow) if t in LARGE else t for t in TASKS])
 def test_complete_episodes_on_mujoco_are_gymnasiums(name):
-    """Actions of all sizes, and small ones, with which more robots stay healthy for long."""
+    """Large and small actions; with small ones, more robots stay healthy for long."""
     found = compare_episodes(envs.make(name, "mujoco"), [record_episode(name, *case) for case in EPISODES])
     assert found.obs <= 1e-5 and found.reward <= 1e-5  # |error| <= 1e-5 + 1e-5 |x|
     assert found.terminations_agree
@@ -88,7 +88,7 @@ def test_time_limit_and_spaces(name):
 
 
 def velocities(name: str) -> slice:
-    positions = recorded(name).qpos.shape[1] - TASKS[name].hidden
+    positions = recorded(name).qpos.shape[1] - TASKS[name].unobserved
     return slice(positions, positions + recorded(name).qvel.shape[1])
 
 

@@ -1,4 +1,4 @@
-"""What a loop runs is counted by the profiler."""
+"""The profiler counts the operations of a loop."""
 
 import gzip
 import json
@@ -17,7 +17,7 @@ from experiments.benchmarks.kernels import Kind
 
 @pytest.fixture(scope="module")
 def kinds():
-    """Of a step with a loop over little data in it, which XLA makes one kernel."""
+    """A step that contains a loop over little data, which XLA makes one kernel."""
 
     @jax.jit
     def run(x, y, steps):

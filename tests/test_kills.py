@@ -8,12 +8,12 @@ from experiments.endurance.training_process import TASKS
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
-    """A training without a break (two, in fact: the same command twice is bit-identical)."""
+    """A training without a break (in fact two: the same command twice is bit-identical)."""
     return train_reference("tiny", "td3_sqt", tmp_path_factory.mktemp("reference") / "run")
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_run_that_is_killed_ends_as_if_it_had_not_been(tmp_path, reference, number):
+def test_a_killed_run_ends_like_a_run_without_a_break(tmp_path, reference, number):
     line = kill_and_resume("tiny", "td3_sqt", tmp_path / "run", reference, number)
     assert "killed a" in line and line.endswith("resumed, identical")
 

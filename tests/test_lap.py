@@ -156,7 +156,7 @@ def test_rows_are_drawn_with_their_exact_probabilities(name):
     rows = np.asarray(drawer(draws)(jax.random.key(3), build(weights)))
     assert rows.min() >= 0 and rows.max() < len(weights)
     probability = weights / weights.sum()
-    # Cells of at least 20 expected draws: neighbouring rows together, where one alone is too unlikely.
+    # Cells of at least 20 expected draws: neighbouring rows together if a single one is too unlikely.
     cell = np.floor(np.cumsum(probability) * draws / 20).astype(int)
     cell = np.unique(np.append(0, cell[:-1]), return_inverse=True)[1]
     expected = np.bincount(cell, probability) * draws
@@ -188,7 +188,7 @@ def uniform_draws(monkeypatch, value):
     monkeypatch.setattr(jax.random, "uniform", draws)
 
 
-LARGEST_DRAW = 1 - 2**-23  # what `jax.random.uniform` gives at most
+LARGEST_DRAW = 1 - 2**-23  # the largest value of `jax.random.uniform`
 
 
 @pytest.mark.parametrize("u", [0.0, 1e-30, 0.5, LARGEST_DRAW])
@@ -200,7 +200,7 @@ def test_an_empty_row_is_never_drawn(monkeypatch, u, rows, large):
     priorities = np.resize([1e-6, large, 0.7, 3.3, 11.1], rows)
     levels = tuple(jnp.zeros(shape) for shape in [(7813, 128), (62, 128), (1, 128)])
     levels = tuple(level.at[: len(own)].set(own) for level, own in zip(levels, build(priorities), strict=False))
-    if len(levels) > len(build(priorities)):  # the levels above are those of the whole buffer
+    if len(levels) > len(build(priorities)):  # the levels above are those of the complete buffer
         levels = build(np.ravel(levels[0])[:1_000_000])
     row = lap.draw_rows(jax.random.key(0), levels, 4)
     assert np.all(row >= 0) and np.all(row < rows)
@@ -215,7 +215,7 @@ def test_an_empty_row_is_never_drawn_whatever_the_order_of_summation(monkeypatch
     weights = generator.uniform(0.5, 20, size=(4096, 128)).astype(np.float32)
     weights[np.arange(128) >= generator.integers(1, 128, size=(4096, 1))] = 0  # a start of each block is filled
     grows = np.diff(np.asarray(jnp.cumsum(weights, axis=-1)), axis=-1) != 0
-    assert np.any(grows & (weights[:, 1:] == 0))  # so it does happen
+    assert np.any(grows & (weights[:, 1:] == 0))  # the case occurs
     chosen = lap.draw(jax.random.key(0), jnp.asarray(weights))
     assert np.all(weights[np.arange(4096), chosen] > 0)
 
@@ -250,12 +250,12 @@ def test_the_priority_is_the_clipped_error_to_the_power(maybe_jit):
     np.testing.assert_array_equal(lap.priority(error, 0.0, 1.0), np.ones(4))
 
 
-def test_a_signed_error_counts_by_its_size_and_one_that_is_not_finite_as_none():
+def test_the_size_of_an_error_counts_and_one_that_is_not_finite_is_0():
     error = jnp.array([-32.0, jnp.nan, jnp.inf, -jnp.inf])
     np.testing.assert_allclose(lap.priority(error, 0.4, 1.0), [4, 1, 1, 1], rtol=1e-6)
 
 
-def test_feedback_sets_the_priorities_of_its_rows_alone():
+def test_feedback_sets_only_the_priorities_of_its_rows():
     *_, feedback = compiled()
     rows = np.arange(0, 960, 60, dtype=np.int32)
     state = feedback(filled(), rows, jnp.full(BATCH, 32.0), jnp.int32(1))
@@ -276,7 +276,7 @@ def test_new_rows_get_the_largest_priority_seen():
     assert state.max_priority == 1 and np.all(np.ravel(state.levels[0])[:100] == 1)
     state = give(state, 32.0, 1)
     np.testing.assert_allclose(state.max_priority, 4, rtol=1e-6)
-    state = give(state, 0.0, 2)  # a smaller one later does not lower it, though no row has it any more
+    state = give(state, 0.0, 2)  # a smaller one later does not lower it, although no row has it any more
     state = extended(state, np.arange(101, 201))
     priorities = np.ravel(state.levels[0])
     np.testing.assert_allclose(priorities[100:200], 4, rtol=1e-6)
@@ -284,7 +284,7 @@ def test_new_rows_get_the_largest_priority_seen():
     np.testing.assert_array_equal(priorities[200:], 0)
 
 
-def test_every_few_updates_alone_the_maximum_becomes_the_buffers():
+def test_the_maximum_becomes_the_buffers_only_every_few_updates():
     state, seen = filled(100), []
     for k, error in enumerate([1.0, 32.0, 1.0, 1.0, 1.0, 1.0, 243.0, 1.0], start=1):
         state = give(state, error, k)
@@ -308,7 +308,7 @@ def test_a_row_that_is_overwritten_loses_its_old_priority():
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
+def test_a_row_that_lost_its_final_observation_is_not_drawn_any_more(num_envs):
     """Every episode is one step, and there is room for those of a tenth of the rows."""
     init, insert, *_ = compiled(num_envs, capacity=40, min_mean_episode_length=10)
     state, room = init(), 4 + num_envs
@@ -323,7 +323,7 @@ def test_a_row_that_lost_its_final_observation_is_drawn_no_more(num_envs):
     after = compiled(num_envs, capacity=40, min_mean_episode_length=10)[3](
         state, gone, np.full(BATCH, 32.0), jnp.int32(1)
     )
-    assert_levels_agree(after.levels, expected)  # also of one that was lost since it was drawn
+    assert_levels_agree(after.levels, expected)  # also for one that was lost since it was drawn
 
 
 # Cost
@@ -360,7 +360,7 @@ def loops():
 
 
 def held_shapes(state):
-    """What grows with the capacity, as the compiled text writes it."""
+    """The shapes that grow with the capacity, as in the compiled text."""
     arrays = state.rows.storage, *state.levels[:-1], state.rows.final_obs, state.rows.final_owner
     kinds = {"float32": "f32", "int32": "s32"}
     return [f"{kinds[leaf.dtype.name]}[{','.join(map(str, leaf.shape))}]" for leaf in arrays]
@@ -411,7 +411,7 @@ def test_only_the_rare_refresh_reads_all_priorities(loops):
             assert bool(readers) == (shape == priorities)  # the refresh's maximum
 
 
-def test_nothing_else_grows_with_the_capacity(loops):
+def test_no_other_operation_grows_with_the_capacity(loops):
     """The two programs differ in the shapes of the state only."""
     programs = {}
     for capacity, (state, executable) in loops.items():

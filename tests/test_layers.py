@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# From the ground up; a module imports from lower layers only, or from its own package further down.
+# The lowest first; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
     {"sqt_jax.types", "sqt_jax.suggestions"},
     {"sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
@@ -63,7 +63,7 @@ OWN_LAYER = {
     "experiments.evidence.statistics",
     "experiments.running.session",  # draws the curves of a finished run
 }
-# Beyond the order of the layers.
+# Further rules.
 REPLAYS = ("sqt_jax.ring", "sqt_jax.replay", "sqt_jax.lap")
 NETWORKS = ("sqt_jax.networks", "sqt_jax.gaussian", "sqt_jax.sale", "sqt_jax.q_targets")
 NEVER = {
@@ -77,7 +77,7 @@ NEVER = {
     "sqt_jax.rollout": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
     "sqt_jax.evaluate": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
 }
-# What an agent may import from others: TD7 is TD3's successor, and the released code varies all three.
+# The agents that an agent may import: TD7 is TD3's successor, and the released code varies all three.
 AGENTS = {
     "critic": (),
     "policy_checkpoints": (),
@@ -100,7 +100,7 @@ MODULES = modules("sqt_jax") | modules("experiments")
 
 
 def imports(source: str, package: str, known=frozenset(MODULES)) -> set[str]:
-    """The modules of this repository that a source text imports, wherever in it."""
+    """The modules of this repository that a source text imports, anywhere in it."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -145,12 +145,12 @@ def test_imports_go_downwards(module):
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_parts_that_must_not_know_each_other(module):
+def test_parts_that_must_not_import_each_other(module):
     forbidden = NEVER.get(unit(module), ())
     assert not [other for other in imported(module) for package in forbidden if inside(other, package)]
 
 
-def test_the_library_knows_neither_experiments_nor_tests():
+def test_the_library_imports_neither_experiments_nor_tests():
     for module in modules("sqt_jax"):
         assert not [other for other in imported(module) if not inside(other, "sqt_jax")]
     assert not [other for module in MODULES for other in imported(module) if inside(other, "tests")]
@@ -172,7 +172,7 @@ def test_agents_import_each_other_only_as_stated():
         assert others <= {f"{package}.{other}" for other in allowed}
 
 
-def test_the_reader_of_imports_sees_all_their_forms():
+def test_every_form_of_import_is_found():
     known = frozenset({"sqt_jax.envs", "sqt_jax.train", "sqt_jax.types", "sqt_jax.agents.sac", "experiments.run"})
     source = (
         "import jax\nimport sqt_jax.envs as e\nfrom sqt_jax import train\nfrom sqt_jax.types import Array\n"

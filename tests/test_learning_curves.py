@@ -1,3 +1,5 @@
+"""Statistics of the tabular learning curves."""
+
 import numpy as np
 import pytest
 from made_curves import curves

@@ -1,3 +1,5 @@
+"""The host loop, with a sweep that only counts: evaluations, chunks, checkpoints, signals, divergence."""
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from sqt_jax.train import Sweep, TrainState
 
 
 class Recorder:
-    """Two members, a sweep that counts instead of training (a second per 100 steps), and a display that keeps quiet."""
+    """Two members, a sweep that counts instead of training (a second per 100 steps), and a silent display."""
 
     def __init__(self, train, breaks_at=None):
         self.train, self.breaks_at = train, breaks_at
@@ -73,7 +75,7 @@ class Recorder:
 TRAIN = TrainConfig(steps=2_000, warmup_steps=750, eval_every=500)
 
 
-def test_evaluations_lie_at_zero_every_interval_and_the_end():
+def test_evaluations_are_at_zero_every_interval_and_the_end():
     recorder = Recorder(TRAIN)
     outcome = recorder.run()
     assert [report.env_steps for report in recorder.reports] == [0, 500, 1_000, 1_500, 2_000]
@@ -107,7 +109,7 @@ def test_environments_in_lockstep_share_the_steps():
     assert [report.env_steps for report in recorder.reports] == [0, 200, 400]
 
 
-def test_metrics_are_those_since_the_last_evaluation():
+def test_metrics_are_over_the_steps_since_the_last_evaluation():
     recorder = Recorder(TRAIN)
     recorder.run()
     updates = [report.metrics["updates"].tolist() for report in recorder.reports[1:]]
@@ -130,11 +132,11 @@ def test_time_left_is_a_lower_bound_until_an_evaluation_was_timed():
     recorder = Recorder(TrainConfig(steps=2_000, warmup_steps=100, eval_every=1_000))
     recorder.run()
     training = [status for status in recorder.statuses if status.phase == "training"]
-    for status in training[1:]:  # of the first, which was not timed before, nothing is known
-        assert status.left.at_least == (status.env_steps < 1_000)  # the first evaluation's time is its compilation's
+    for status in training[1:]:  # nothing was timed before the first
+        assert status.left.at_least == (status.env_steps < 1_000)  # the first evaluation's time is compilation
 
 
-def test_stopping_reports_what_there_is():
+def test_a_stopped_run_reports_its_last_interval():
     recorder = Recorder(TRAIN)
     outcome = recorder.run(stop=lambda: recorder.done >= 1_100)
     assert outcome.interrupted and 1_100 <= outcome.env_steps < 1_500
@@ -164,7 +166,7 @@ def test_a_member_that_diverges_is_named_once_and_its_later_returns_do_not_count
         assert np.isfinite(report.returns[0]).all()
 
 
-def test_checkpoints_lie_at_their_interval_and_at_the_end():
+def test_checkpoints_are_at_their_interval_and_at_the_end():
     assert checkpoint_steps(300, 0, 1_000) == [300, 600, 900, 1_000]
     assert checkpoint_steps(300, 600, 900) == [900]
     assert checkpoint_steps(300, 1_000, 1_000) == checkpoint_steps(0, 0, 1_000) == []
@@ -185,7 +187,7 @@ def test_without_checkpoints_nothing_is_saved():
     assert recorder.saved == []
 
 
-def test_an_interrupted_run_is_saved_before_what_there_is_is_reported():
+def test_an_interrupted_run_is_saved_before_its_last_report():
     recorder = Recorder(TRAIN)
     outcome = recorder.run(stop=lambda: recorder.done >= 1_100, checkpoint_every=1_000)
     last = recorder.saved[-1]
@@ -195,7 +197,7 @@ def test_an_interrupted_run_is_saved_before_what_there_is_is_reported():
 @pytest.mark.parametrize(
     ("at", "evaluated", "left"), [(1_200, 1_000, [1_500, 2_000]), (1_000, 500, [1_000, 1_500, 2_000])]
 )
-def test_a_run_goes_on_where_it_stood(at, evaluated, left):
+def test_a_run_resumes_at_its_position(at, evaluated, left):
     recorder = Recorder(TRAIN)
     start = Position(at, evaluated, ((1, 800),), 7.0)
     outcome = recorder.run(start=start)
@@ -206,14 +208,14 @@ def test_a_run_goes_on_where_it_stood(at, evaluated, left):
     assert all(np.isnan(report.returns[1]).all() for report in recorder.reports)
 
 
-def test_where_only_the_last_evaluation_is_left_a_checkpoint_follows_it():
+def test_if_only_the_last_evaluation_is_left_a_checkpoint_follows_it():
     recorder = Recorder(TRAIN)
     recorder.run(start=Position(2_000, 1_500), checkpoint_every=250)
     assert recorder.calls == [] and [report.env_steps for report in recorder.reports] == [2_000]
     assert [(at.env_steps, at.evaluated) for at in recorder.saved] == [(2_000, 2_000)]
 
 
-def test_a_run_that_is_done_stays_as_it_is():
+def test_a_finished_run_does_not_change():
     recorder = Recorder(TRAIN)
     outcome = recorder.run(start=Position(2_000, 2_000, (), 5.0), checkpoint_every=250)
     assert recorder.calls == recorder.reports == recorder.saved == []

@@ -1,4 +1,4 @@
-"""The soak test makes the steps that it says, and fails if a number is not finite or the memory grows."""
+"""The soak test makes the steps that it reports, and fails if a number is not finite or the memory grows."""
 
 import re
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+"""HTML elements, inline figures and complete pages; no text becomes markup."""
+
 import base64
 import hashlib
 import re
@@ -62,7 +64,7 @@ def test_a_figure_needs_no_inline_style(figure):
     assert any(node.attrib.get("fill-opacity") == "0.2" for node in svg.iter())
 
 
-def test_a_page_allows_its_own_style_and_script_alone():
+def test_a_page_allows_only_its_own_style_and_script():
     style, script = "p > b { color: red }", 'if (1 < 2 && "é") { }'
     text = document("a & b", style, script, element("p", "x"))
     assert text.startswith("<!DOCTYPE html>\n<html") and f"<style>{style}</style>" in text

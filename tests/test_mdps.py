@@ -18,7 +18,7 @@ def two_states():
 def test_optimal_values_by_hand():
     # gamma 1/2: V(1) = 4; V(0) = max(1 + V(0) / 2, 4 / 2) = 2 either way; going back gives 1.
     np.testing.assert_allclose(mdps.optimal_q(two_states(), 0.5), [[2.0, 2.0], [4.0, 1.0]], atol=1e-11)
-    # gamma 0.9: staying for ever gives 10; going back from 1 gives 9, which beats 4.
+    # gamma 0.9: always staying gives 10; going back from 1 gives 9, which beats 4.
     np.testing.assert_allclose(mdps.optimal_q(two_states(), 0.9), [[10.0, 8.1], [4.0, 9.0]], atol=1e-10)
     np.testing.assert_array_equal(mdps.optimal_q(two_states(), 0.0), two_states().reward)
 
@@ -47,7 +47,7 @@ def test_probabilities(name):
     assert reached.all()
 
 
-def test_the_chain_is_best_left_at_once():
+def test_leaving_the_chain_at_once_is_optimal():
     q = mdps.optimal_q(mdps.bias_chain(links=3, actions=4, mean=-0.1), 0.5)
     after = -0.1 * (1 + 0.5 + 0.25)
     np.testing.assert_allclose(q[0], [0, 0, 0.5 * after, 0.5 * after])
@@ -56,7 +56,7 @@ def test_the_chain_is_best_left_at_once():
 
 def test_the_grid_without_slipping():
     q = mdps.optimal_q(mdps.grid_world(size=2, slip=0.0, step=-0.1), 0.5)
-    # moves: up, down, left, right; states: 0 1 / 2 goal. From 1 down, and from 2 right, there is the goal.
+    # moves: up, down, left, right; states: 0 1 / 2 goal. The goal is down from 1, and right from 2.
     np.testing.assert_allclose(q[1], [-0.1 + 0.5, 1.0, -0.1 + 0.5 * 0.4, -0.1 + 0.5])
     np.testing.assert_allclose(q[0].max(), -0.1 + 0.5 * 1.0)
 
@@ -68,7 +68,7 @@ def test_slipping_goes_in_any_direction():
     np.testing.assert_allclose(mdp.reward[7, 3], 0.7 * 1 + 0.3 * -0.1)
 
 
-def test_centred_values_are_0_on_average_where_nothing_ends():
+def test_centred_values_are_0_on_average_if_no_episode_ends():
     mdp = mdps.centred(mdps.random_mdp(5), 0.8)
     assert mdps.optimal_q(mdp, 0.8).mean() == pytest.approx(0, abs=1e-10)
     chain = mdps.bias_chain()

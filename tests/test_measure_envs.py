@@ -6,7 +6,7 @@ from experiments.benchmarks import measure_envs
 
 
 @pytest.mark.parametrize("task", ["swimmer", "humanoid"])
-def test_mujoco_alone_steps_with_and_without_contact_forces(task, monkeypatch):
+def test_mujoco_without_jax_steps_with_and_without_contact_forces(task, monkeypatch):
     made = []
     original = measure_envs.mujoco.mj_rnePostConstraint
     monkeypatch.setattr(measure_envs.mujoco, "mj_rnePostConstraint", lambda *args: made.append(original(*args)))

@@ -1,4 +1,4 @@
-"""Members along devices: how many each holds, and that nothing depends on where they lie."""
+"""Members along devices: how many each holds, and results do not depend on the device."""
 
 import math
 import os
@@ -22,13 +22,13 @@ two_devices = pytest.mark.skipif(len(DEVICES) < 2, reason="one device only")
 
 
 @pytest.mark.parametrize(
-    ("count", "devices", "held"), [(1, 0, 1), (5, 1, 5), (4, 2, 4), (5, 2, 6), (3, 8, 8), (9, 4, 12)]
+    ("count", "devices", "size"), [(1, 0, 1), (5, 1, 5), (4, 2, 4), (5, 2, 6), (3, 8, 8), (9, 4, 12)]
 )
-def test_shares_are_equal(count, devices, held):
+def test_shares_are_equal(count, devices, size):
     layout = Layout(count, (jax.devices()[0],) * devices)
-    assert layout.held == held
-    filled = layout.filled(np.arange(count))
-    assert list(filled) == [index % count for index in range(held)]
+    assert layout.padded_size == size
+    padded = layout.padded(np.arange(count))
+    assert list(padded) == [index % count for index in range(size)]
 
 
 @pytest.mark.parametrize(
@@ -38,15 +38,15 @@ def test_shares_are_equal(count, devices, held):
         (4, 4, 4),
         (8, 5, 5),
         (32, 25, 25),
-        (4, 5, 3),  # shares of two: the fourth would hold copies alone
+        (4, 5, 3),  # shares of two: the fourth would hold copies only
         (4, 7, 4),
         (8, 17, 6),
     ],
 )
-def test_a_sweep_takes_the_devices_that_get_members(monkeypatch, here, count, used):
+def test_a_sweep_uses_the_devices_that_get_members(monkeypatch, here, count, used):
     monkeypatch.setattr(jax, "local_devices", lambda: list(range(here)))
     assert members.usable_devices(count) == used
-    assert Layout(count, (jax.devices()[0],) * used).held - count < math.ceil(count / used)
+    assert Layout(count, (jax.devices()[0],) * used).padded_size - count < math.ceil(count / used)
 
 
 def trained(sweep, config, count):
@@ -91,11 +91,11 @@ def test_members_train_on_two_devices_as_on_one(both):
 
 
 @two_devices
-def test_each_device_holds_its_share_alone(both):
+def test_each_device_holds_only_its_share(both):
     _, (_, (_, state)) = both
     for leaf in jax.tree.leaves((state.agent.actor, state.replay)):
         if not leaf.ndim:
-            continue  # a counter, which all share
+            continue  # a shared counter
         assert {shard.device for shard in leaf.addressable_shards} == set(DEVICES)
         assert [shard.data.shape[0] for shard in leaf.addressable_shards] == [2, 2]
 
@@ -133,7 +133,7 @@ def test_members_train_over_two_processes_as_in_one(tmp_path):
         for process in started:
             output, _ = process.communicate(timeout=240)
             assert process.returncode == 0, output
-    finally:  # where one ended or hangs, the other waits for it
+    finally:  # if one ended or hangs, the other waits for it
         for process in started:
             process.kill()
             process.wait()

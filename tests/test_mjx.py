@@ -109,7 +109,7 @@ def test_solver_options_reach_the_solver(options, expected, monkeypatch):
     assert solver_settings(options, monkeypatch) == expected
 
 
-def test_none_takes_the_files_settings(monkeypatch):
+def test_none_means_the_files_settings(monkeypatch):
     model = gym_tasks.load_model(TASKS["humanoid"])
     options = {"iterations": None, "ls_iterations": None}
     assert solver_settings(options, monkeypatch) == (model.opt.iterations, model.opt.ls_iterations)
@@ -121,7 +121,7 @@ def solver_settings(options, monkeypatch):
     monkeypatch.setattr(mjx.mjx, "put_model", lambda model, **kw: seen.append(put_model(model, **kw)) or seen[-1])
     model = gym_tasks.load_model(TASKS["humanoid"])
     mjx.make(Setup(model, 5), **options)
-    assert model.opt.solver == mujoco.mjtSolver.mjSOL_PGS  # the caller's model is left alone
+    assert model.opt.solver == mujoco.mjtSolver.mjSOL_PGS  # the caller's model is not changed
     assert seen[0].opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
     return seen[0].opt.iterations, seen[0].opt.ls_iterations
 
@@ -135,13 +135,13 @@ def test_unknown_options_and_integrators_are_rejected():
 
 @pytest.mark.parametrize("name", ["cheetah", "humanoid"])
 def test_state_is_small(name):
-    # what a restart selects: qpos, qvel, warm start, the tracked point, quantities; not MJX's Data
+    # the arrays that a restart selects: qpos, qvel, warm start, the tracked point, quantities; not MJX's Data
     timestep = jax.eval_shape(envs.make(name).reset, jax.random.key(0))
     task = sum(leaf.size for leaf in jax.tree.leaves(timestep.state.task))
     assert task < timestep.obs.size + 40
 
 
-def test_matrix_products_are_in_full_precision_whatever_the_program_around_asks():
+def test_matrix_products_have_full_precision_in_any_program():
     env = envs.make("cheetah")
     timestep = jax.eval_shape(env.reset, jax.random.key(0))
     with (

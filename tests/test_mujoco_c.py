@@ -43,14 +43,14 @@ def test_a_step_is_a_function_of_the_state_it_is_given(ant):
     physics, model, advance = ant
     state, control = robots(physics, model, 7)
     once = advance(state, control)
-    advance(once, -control)  # leaves its marks in MuJoCo's own memory
+    advance(once, -control)  # changes MuJoCo's own memory
     assert same(advance(state, control), once)
     order = np.random.default_rng(0).permutation(7)
     shuffled = advance(jax.tree.map(lambda leaf: leaf[order], state), control[order])
     assert same(shuffled, jax.tree.map(lambda leaf: leaf[order], once))
 
 
-def test_one_robot_alone_is_as_among_others(ant):
+def test_one_robot_moves_alone_as_among_others(ant):
     physics, model, advance = ant
     state, control = robots(physics, model, 5)
     together = advance(advance(state, control), control)
@@ -123,7 +123,7 @@ def test_the_state_is_carried_in_float64(ant):
 def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     env = envs.make("ant", "mujoco")
-    gym_tasks.load_model(TASKS["cheetah"])  # which has to do with MuJoCo's warnings too
+    gym_tasks.load_model(TASKS["cheetah"])  # it sets MuJoCo's warning handler too
     timestep = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
     qvel = timestep.state.task.qvel.at[1, 2].set(fault)
     broken = jax.vmap(env.set_physics)(timestep.state.task.qpos, qvel)
@@ -138,7 +138,7 @@ def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeyp
     assert capfd.readouterr().err == ""
 
 
-def test_a_warning_handler_of_ones_own_stays(ant):
+def test_a_warning_handler_of_the_user_stays(ant):
     physics, model, advance = ant
     heard = []
     before = mujoco.get_mju_user_warning()
@@ -168,7 +168,7 @@ def test_programs_in_several_threads_do_not_disturb_each_other(ant, count):
     assert len(threads._pools) == (count > 1)
 
 
-def test_no_threads_are_rejected():
+def test_zero_threads_are_rejected():
     with pytest.raises(ValueError, match="num_threads: expected a whole number of at least 1, got 0"):
         mujoco_c.make(setup_of("ant"), num_threads=0)
 

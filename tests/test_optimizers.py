@@ -1,4 +1,4 @@
-"""Adam against optax's own, the soft step of target networks, and that neither moves what has diverged."""
+"""Adam against optax's own, the soft step of target networks, and that neither changes a diverged agent."""
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ def test_learning_rates_share_one_compilation():
     assert_same(change, jax.tree.map(lambda p: jnp.full(p.shape, 10.0), PARAMS), rtol=1e-2)
 
 
-def test_learning_rate_zero_moves_nothing_but_the_moments():
+def test_learning_rate_zero_changes_only_the_moments():
     params, opt_state = run(0.0, 2)
     assert_same(params, PARAMS)
     assert opt_state.count == 2

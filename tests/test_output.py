@@ -9,7 +9,7 @@ from experiments.commandline.arguments import UsageError
 
 
 def test_ratios_are_of_one_task_and_number_of_members():
-    rates = {"MuJoCo alone": 100.0, "mujoco": 90.0, "mjx": 50.0, "mjx, the file's iterations": 20.0}
+    rates = {"MuJoCo without JAX": 100.0, "mujoco": 90.0, "mjx": 50.0, "mjx, the file's iterations": 20.0}
     found = [Measurement("physics", f"ant, {what}", 5, "env steps", rate, 0.0) for what, rate in rates.items()]
     loops = {"td3 on ant, mjx": 200.0, "td3 on ant, mujoco": 250.0, "td3 on walker, mujoco": 300.0}
     loops["td3 on ant, warp"] = 500.0
@@ -18,7 +18,7 @@ def test_ratios_are_of_one_task_and_number_of_members():
         Measurement("loop", f"{what}, 5 devices", 5, "env steps", 3 * rate, devices=5) for what, rate in loops.items()
     ]
     assert output.physics_ratios(found) == [
-        "ant, 5 members: mujoco / MuJoCo alone = 0.90",
+        "ant, 5 members: mujoco / MuJoCo without JAX = 0.90",
         "ant, 5 members: mjx / mjx, the file's iterations = 2.50",
         "td3 on ant, 5 members: mujoco / mjx = 1.25",
         "td3 on ant, 5 members: warp / mjx = 2.50",

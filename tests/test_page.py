@@ -1,3 +1,5 @@
+"""The report as a page: its parts, links, sort keys."""
+
 from datetime import UTC, datetime
 
 import pytest
@@ -35,11 +37,11 @@ def content_of(folder, reference=False):
         ("td3", None),
     ],
 )
-def test_what_a_cell_is_sorted_by(text, key):
+def test_sort_keys_of_cells(text, key):
     assert sort_key(Cell((text, "12.0 below"), (1,))) == key
 
 
-def test_everything_is_there_in_its_order(tmp_path):
+def test_all_parts_are_in_order(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 5, 10], [0, 6, 11]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 5, 12]])
     table = write_run(tmp_path, "sac") / "evaluations.csv"
@@ -69,7 +71,7 @@ def test_everything_is_there_in_its_order(tmp_path):
     assert read.tags.count("svg") == read.tags.count("figure") == 3
 
 
-def test_footnotes_are_linked_and_no_id_is_there_twice(tmp_path):
+def test_footnotes_are_linked_and_ids_are_unique(tmp_path):
     write_run(tmp_path, "td3", curves=[[0, 5, 10], [0, 6, 11]])
     write_run(tmp_path, "td3_sqt", curves=[[0, 5, 12]])
     write_run(tmp_path, "td3_sqt_tuple", curves=[[0, 5, 12]])
@@ -94,7 +96,7 @@ def test_many_names_are_counted_in_the_title(tmp_path):
     assert "<title>sqt_jax report: 4 algorithms on cheetah</title>" in page(content_of(tmp_path))
 
 
-def test_scores_and_the_comparisons_beneath_them_are_sorted_apart(tmp_path):
+def test_scores_and_the_comparisons_below_them_are_sorted_separately(tmp_path):
     for algo in ("td3", "td3_sqt", "td3_sqt_tuple"):
         write_run(tmp_path, algo, curves=[[0, 5, 10]])
     assert page(content_of(tmp_path)).count('class="apart"') == 1  # table 4

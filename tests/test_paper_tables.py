@@ -1,3 +1,5 @@
+"""Tables 2 to 4 and the table of seeds by hand."""
+
 from made_runs import write_run
 from table_reader import cells
 
@@ -49,7 +51,7 @@ def test_a_cell_without_an_evaluation_of_all_seeds(tmp_path):
     assert "its seeds have no evaluation in common" in table.notes
 
 
-def test_what_a_rows_tasks_do_not_share_is_said(tmp_path):
+def test_settings_in_which_a_rows_tasks_differ_are_noted(tmp_path):
     write_run(tmp_path, "td3_sqt", "cheetah", penalty_coef=0.5)
     write_run(tmp_path, "td3_sqt", "ant", penalty_coef=0.25, steps=200, physics="mujoco")
     table = table_2(collect([str(tmp_path)]), reference=False)
@@ -96,13 +98,13 @@ def test_variants_that_differ_in_more_than_the_penalty_are_not_compared(tmp_path
     assert table.notes == ["not compared: td3_sqt and td3_sqt_tuple on cheetah differ in tau (0.005, 0.1)"]
 
 
-def test_tables_with_nothing_in_them_are_not_made(tmp_path):
+def test_empty_tables_are_not_made(tmp_path):
     write_run(tmp_path, "td3")
     names = [table.name for table in make_tables(collect([str(tmp_path)]))]
     assert names == ["table2", "table3", "seeds"]
 
 
-def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
+def test_published_figures_are_below_ours_with_version_and_source(tmp_path):
     write_run(tmp_path, "td3_sqt", "humanoid", curves=[[0, 1, 2]])
     write_run(tmp_path, "sac", "ant-v5")
     runs = collect([str(tmp_path)])
@@ -110,7 +112,7 @@ def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
     rows = [row for row in cells(table)]
     assert table.header[1:3] == ["humanoid", "ant-v5"]
     labels = [row[0] for row in rows]
-    # Those of the baseline, of which there is no run; then ours and its own.
+    # Published numbers of the baseline, which was not run; then our row and its published numbers.
     assert labels[0].startswith("published: td3, environment v3, 10 seeds|Tianshou")
     ours = labels.index("td3_sqt")
     released = rows[ours + 1]
@@ -124,7 +126,7 @@ def test_published_figures_lie_beneath_ours_with_version_and_source(tmp_path):
     assert [row[1] for row in q_std if "published: td3_sqt" in row[0]] == ["2.11"]
 
 
-def test_nothing_published_is_said(tmp_path):
+def test_missing_published_numbers_are_noted(tmp_path):
     write_run(tmp_path, "redq", "brax:ant")
     table = table_2(collect([str(tmp_path)]), reference=True)
     assert table.caption.endswith("No published numbers for these algorithms and tasks.")

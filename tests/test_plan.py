@@ -46,7 +46,7 @@ def test_a_new_run_has_a_folder_of_its_own(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_resume_alone_finds_the_latest_run_of_the_same_settings(tmp_path):
+def test_resume_without_a_name_finds_the_latest_run_of_the_same_settings(tmp_path):
     begun(tmp_path, "c_old", started="2025-01-01T00:00:00+00:00")
     latest = begun(tmp_path, "b_new", started="2025-03-01T00:00:00+00:00")
     begun(tmp_path, "a_between", started="2025-02-01T00:00:00+00:00")
@@ -61,7 +61,7 @@ def test_resume_alone_finds_the_latest_run_of_the_same_settings(tmp_path):
 
 
 @pytest.mark.parametrize("sweep", ["--lr=1e-3,1e-4", "--penalty_coef=0.1,0.2", "--temperature=0.1"])
-def test_resume_alone_tells_sweeps_apart(tmp_path, sweep):
+def test_resume_without_a_name_distinguishes_sweeps(tmp_path, sweep):
     path = begun(tmp_path, "swept", sweep)
     begun(tmp_path, "plain", started="2026-01-01T00:00:00+00:00")
     assert plan(tmp_path, "--resume", sweep).path == path
@@ -76,13 +76,13 @@ def test_with_a_name_resume_finds_that_run(tmp_path):
     assert made.path == path and made.resumed
 
 
-def test_with_a_name_that_no_run_has_resume_begins_one(tmp_path):
+def test_with_a_new_name_resume_starts_a_run(tmp_path):
     begun(tmp_path, "a")
     made = plan(tmp_path, "--resume", "--name=b")
     assert made.path.name == "b" and made.resumed is None and not made.path.exists()
 
 
-def test_with_the_name_of_a_folder_that_is_no_run_resume_is_rejected(tmp_path):
+def test_resume_with_the_name_of_a_folder_without_a_run_is_rejected(tmp_path):
     path = tmp_path / "ant" / "sac_sqt" / "a"
     path.mkdir(parents=True)
     (path / "mine").write_text("")
@@ -105,7 +105,7 @@ def test_a_run_may_get_more_steps_and_keeps_its_replay(tmp_path):
         ]
 
 
-def test_a_folder_says_what_run_it_is(tmp_path):
+def test_a_folder_needs_no_other_flags(tmp_path):
     path = begun(tmp_path, "a", "--lr=1e-3,1e-4")
     made, new = plan(tmp_path, f"--resume={path}", new=""), plan(tmp_path, "--lr=1e-3,1e-4", "--name=b")
     for one, other in zip(made.members, new.members, strict=True):
@@ -130,13 +130,13 @@ DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints":
         ({"devices": 99}, ["--devices=1"], {"devices": 1}),
         ({"devices": 0}, [], {}),
         ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
-        # What no command line could have given counts as not there.
+        # Values that no command line could have given are ignored.
         ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
         ({"checkpoint_every": "often", "keep_checkpoints": True, "tensorboard": None, "more": 1}, [], {}),
     ],
     ids=lambda value: str(value) if isinstance(value, list) else "",
 )
-def test_given_flags_win_over_the_runs_and_these_over_the_defaults(tmp_path, its, given, expected):
+def test_given_flags_override_the_runs_and_these_the_defaults(tmp_path, its, given, expected):
     path = begun(tmp_path, "a", **its)
     assert plan(tmp_path, f"--resume={path}", *given, new="").output == DEFAULTS | expected
 
@@ -148,7 +148,7 @@ def test_the_default_checkpoints_fit_the_environments(tmp_path):
         plan(tmp_path, "--num_envs=3", "--warmup_steps=21", "--checkpoint_every=20", "--name=a")
 
 
-def test_a_run_that_is_in_the_way_is_rejected_unless_it_is_to_be_replaced(tmp_path):
+def test_an_existing_run_is_rejected_without_overwrite(tmp_path):
     path = begun(tmp_path, "a")
     with pytest.raises(flags.UsageError, match="^--name=a: .* expects another name, or --overwrite replaces it$"):
         plan(tmp_path, "--name=a")
@@ -159,14 +159,14 @@ def test_a_run_that_is_in_the_way_is_rejected_unless_it_is_to_be_replaced(tmp_pa
         plan(tmp_path, "--name=a", "--overwrite")
 
 
-def test_there_is_no_device_without_a_member(tmp_path, monkeypatch):
+def test_every_device_has_a_member(tmp_path, monkeypatch):
     monkeypatch.setattr(jax, "local_devices", lambda: jax.devices() * 4)
     with pytest.raises(flags.UsageError, match=r"^--devices=3: expects at most one for each of 2 members$"):
         plan(tmp_path, "--seeds=0,1", "--devices=3", "--name=a")
-    assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.held == 4
+    assert plan(tmp_path, "--seeds=0,1,2", "--devices=2", "--name=a").layout.padded_size == 4
 
 
-def test_devices_that_nobody_named_are_chosen_again_where_a_run_goes_on(tmp_path, monkeypatch):
+def test_default_devices_are_chosen_again_when_a_run_resumes(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(jax, "local_devices", lambda: jax.devices()[:1] * 4)
         path = begun(tmp_path, "a")
@@ -182,7 +182,7 @@ def test_devices_that_nobody_named_are_chosen_again_where_a_run_goes_on(tmp_path
     assert len(plan(tmp_path, f"--resume={named}", "--devices=1", new="").layout.devices) == 1
 
 
-# An environment handed in. Needs `make_config` to accept an `Environment`, and `flags.parse(argv, needs_env=False)`.
+# An environment handed in
 
 OWN = NEW.replace("--env=ant ", "")
 
@@ -218,7 +218,7 @@ def test_an_environment_handed_in_names_the_folder(tmp_path, name, folder):
         ("point", ["--eval_physics=mjx"], "^--eval_physics: has no effect with an environment handed in$"),
     ],
 )
-def test_what_contradicts_an_environment_handed_in_is_rejected(tmp_path, name, arguments, message):
+def test_flags_that_contradict_an_environment_handed_in_are_rejected(tmp_path, name, arguments, message):
     with pytest.raises(flags.UsageError, match=message):
         own_plan(tmp_path, point(name), "--name=a", *arguments)
 
@@ -235,7 +235,7 @@ def test_own_physics_needs_an_environment_handed_in(tmp_path):
         plan(tmp_path, "--name=a", "--physics=own")
 
 
-def test_runs_of_the_task_of_that_name_are_told_apart(tmp_path):
+def test_runs_of_the_task_of_that_name_are_distinguished(tmp_path):
     task = begun(tmp_path, "task")
     with pytest.raises(flags.UsageError, match="expects no environment handed in; the run was trained on ant"):
         own_plan(tmp_path, point("ant"), f"--resume={task}", new="")

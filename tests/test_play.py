@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A run of two seeds, 3 and 5, of which 5 is the better; one of Brax's; and a folder of another kind."""
+    """A run of two seeds, 3 and 5, of which 5 is the better; one of Brax's; and a folder without a run."""
     folder = tmp_path_factory.mktemp("runs")
     path = write_run(folder, "td3", "hopper", [[0, 1], [0, 2]], seeds=(3, 5), hidden=(8, 8))
     add_policies(path, envs.make("hopper", "mujoco"), [1, 2])
@@ -99,7 +99,7 @@ def test_a_member_is_named_and_steps_are_limited(folder, capsys):
     assert play.main(["play", RUN, "--seed=3", "--steps=4"]) == 0
     out = capsys.readouterr().out
     assert "member 0, seed 3 (of 2)" in out and "4 steps, 0.0 s, cut off" in out
-    assert out.endswith("no display here: --video=FILE films it\n")
+    assert out.endswith("no display here: --video=FILE writes a film\n")
 
 
 def test_where_there_is_a_display_mujocos_viewer_shows_it(folder, capsys, monkeypatch):
@@ -157,7 +157,7 @@ REJECTED = [
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(("arguments", "says"), REJECTED, ids=[ascii(row[0])[1:60] for row in REJECTED])
-def test_bad_usage_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
+def test_an_invalid_command_is_one_line_and_nothing_is_written(folder, pictures, capsys, arguments, says):
     before = sorted(folder.rglob("*"))
     assert play.main(["play", *(word for word in arguments.split(" ") if word)]) == 2
     out, err = capsys.readouterr()
@@ -175,7 +175,7 @@ def test_without_opengl_a_film_is_rejected_before_anything_is_played(folder, cap
     assert not Path("film.mp4").exists()
 
 
-def test_an_interrupt_is_no_traceback(monkeypatch):
+def test_an_interrupt_prints_no_traceback(monkeypatch):
     def interrupted(argv):
         raise KeyboardInterrupt
 

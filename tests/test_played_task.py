@@ -4,7 +4,7 @@ import mujoco
 import pytest
 
 from experiments.commandline.arguments import UsageError
-from experiments.playing.played_task import make_task
+from experiments.playing.played_task import make_played_task
 from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
 
@@ -12,10 +12,10 @@ HOPPER = make_config("td3", "hopper")
 
 
 def test_a_task_is_played_on_mujoco_by_default():
-    task = make_task(HOPPER, None, "")
+    task = make_played_task(HOPPER, None, "")
     assert (task.env.name, task.physics) == ("hopper", "mujoco") and task.period == pytest.approx(0.008)
     assert isinstance(task.scene, mujoco.MjModel)
-    assert make_task(HOPPER, "mjx", "track").physics == "mjx"
+    assert make_played_task(HOPPER, "mjx", "track").physics == "mjx"
 
 
 @pytest.mark.parametrize(
@@ -29,4 +29,4 @@ def test_a_task_is_played_on_mujoco_by_default():
 def test_other_physics_and_cameras_are_rejected(asked, camera, says, monkeypatch):
     monkeypatch.setitem(physics.LACKS, "warp", lambda: "a part")
     with pytest.raises(UsageError, match=says):
-        make_task(HOPPER, asked, camera)
+        make_played_task(HOPPER, asked, camera)

@@ -1,3 +1,5 @@
+"""The plots command."""
+
 import pytest
 from made_runs import write_run
 from matplotlib.image import imread
@@ -14,7 +16,7 @@ def runs(tmp_path):
     return tmp_path / "runs"
 
 
-def test_every_figure_is_drawn_and_replaced_only_where_asked(runs, tmp_path, capsys):
+def test_every_figure_is_drawn_and_replaced_only_with_overwrite(runs, tmp_path, capsys):
     out = tmp_path / "figures"
     assert main(["plots", str(runs), f"--out={out}"]) == 0
     names = ["learning_curves", "q_std", "value_bias", "value_bias_normalised", "penalty_sweep", "performance_profile"]
@@ -29,7 +31,7 @@ def test_every_figure_is_drawn_and_replaced_only_where_asked(runs, tmp_path, cap
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_what_there_is_nothing_of_is_said(runs, tmp_path, capsys):
+def test_figures_with_nothing_to_draw_are_named(runs, tmp_path, capsys):
     out = tmp_path / "figures"
     argv = ["plots", str(runs / "cheetah" / "td3"), f"--out={out}", "--format=svg", "--statistic=mean"]
     assert main(argv) == 0
@@ -47,7 +49,7 @@ def test_what_there_is_nothing_of_is_said(runs, tmp_path, capsys):
         (["none"], "none: does not exist"),
     ],
 )
-def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
+def test_an_invalid_command_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     assert main(["plots", *argv]) == 2

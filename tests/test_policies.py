@@ -37,7 +37,7 @@ def run(tmp_path_factory):
         ([10, 40, 30, 20], {"number": 3, "seed": 5}, 3, "of 4"),
     ],
 )
-def test_the_best_is_chosen_of_those_that_are_asked_for(run, returns, asked, member, why):
+def test_the_best_of_the_requested_members_is_chosen(run, returns, asked, member, why):
     chosen = policies.choose(policies.read(run), returns, **asked)
     assert (chosen.number, chosen.why) == (member, why)
     assert chosen.member.seed == (3, 5)[member % 2]
@@ -120,7 +120,7 @@ def other_sizes(path):
         (other_sizes, "policy: is not a policy for hopper: its sizes are 2 and 1"),
     ],
 )
-def test_a_policy_that_cannot_be_played_is_rejected_in_a_line(run, tmp_path, change, says):
+def test_a_policy_that_cannot_be_played_is_rejected_in_one_line(run, tmp_path, change, says):
     path = tmp_path / "run"
     shutil.copytree(run, path)
     change(path)

@@ -43,7 +43,7 @@ def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
 
 
 def test_one_agents_state_without_an_axis_of_members_is_rejected(tmp_path):
-    """Its first rows would be taken for members."""
+    """Its first axis would be read as members."""
     env = probe_envs.constant_reward()
     config = algorithms.make_config("td3", "cheetah", hidden=(8, 8))
     state = algorithms.agent_of(config, env).init(jax.random.key(1))
@@ -80,7 +80,7 @@ def test_a_missing_member_is_named(tmp_path):
         policy.load_policy(tmp_path / "policy", member=7)
 
 
-# A folder made to do harm, or damaged. `damage` gets the folder.
+# A hostile or damaged folder. `damage` gets the folder.
 
 
 class Touch:
@@ -137,7 +137,7 @@ def flipped(folder):
 
 
 def header(text):
-    """Arrays whose header says `text` and that hold nothing."""
+    """Arrays with the header `text` and no data."""
 
     def damage(folder):
         with zipfile.ZipFile(folder / "member_0.npz") as archive:

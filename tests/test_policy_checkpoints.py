@@ -1,4 +1,4 @@
-"""TD7's policy checkpoints by hand: what the end of an episode does to snapshot, checkpoint and counters."""
+"""TD7's policy checkpoints by hand: snapshot, checkpoint and counters after the end of an episode."""
 
 import jax
 import jax.numpy as jnp
@@ -45,15 +45,15 @@ def test_before_the_switch_each_episode_is_an_assessment():
     _, rows = story(START, 5.0, 3.0, 7.0, 7.0, -2.0)
     assert rows == [
         # snapshot, checkpoint, best, min, episodes, assessments, refreshes
-        (1, 0, 5, 1e8, 0, 1, 1),  # the policy that was assessed is the checkpoint, not the learner of now
-        (2, 0, 5, 1e8, 0, 2, 1),  # worse: 1 is given up
+        (1, 0, 5, 1e8, 0, 1, 1),  # the checkpoint is the assessed policy, not the current learner
+        (2, 0, 5, 1e8, 0, 2, 1),  # worse: policy 1 is dropped
         (3, 2, 7, 1e8, 0, 3, 2),
-        (4, 3, 7, 1e8, 0, 4, 3),  # as good is good enough
+        (4, 3, 7, 1e8, 0, 4, 3),  # an equal return suffices
         (5, 3, 7, 1e8, 0, 5, 3),
     ]
 
 
-def test_after_the_switch_an_assessment_takes_its_episodes_and_ends_early_below_the_best():
+def test_after_the_switch_an_assessment_has_several_episodes_and_ends_early_below_the_best():
     state = START._replace(snapshot=labelled(50), best_min_return=jnp.float32(6))
     _, rows = story(state, 8.0, 9.0, 7.0, 9.0, 6.5, 7.0, 8.0, 7.5, gradient_steps=SWITCH)
     assert rows == [
@@ -73,7 +73,7 @@ def test_the_switch_is_a_number_of_gradient_steps():
         assert assess(START, 1, gradient_steps, 5.0).assessments == assessments
 
 
-def test_an_assessment_that_the_switch_finds_under_way_goes_on():
+def test_an_assessment_in_progress_continues_over_the_switch():
     state = assess(START, 1, SWITCH, 5.0)
     assert (state.episodes, state.assessments) == (1, 0)
     _, rows = story(state, 6.0, 4.0, gradient_steps=SWITCH + 100, learners=[2, 3])
@@ -87,12 +87,12 @@ def test_a_running_episode_changes_nothing(episode_return):
         assert same(assess(state, 9, gradient_steps, episode_return, ended=False), state)
 
 
-def test_at_the_start_the_policy_is_all_there_is():
+def test_at_the_start_snapshot_and_checkpoint_are_the_policy():
     assert same(policy_checkpoints.start(labelled(0)), START)
 
 
 @pytest.mark.parametrize(("best", "reset"), [(100.0, 90.0), (-100.0, -90.0)])
-def test_the_best_is_lowered_at_the_switch_alone(best, reset):
+def test_the_best_is_lowered_only_at_the_switch(best, reset):
     state = START._replace(best_min_return=jnp.float32(best))
     lowered = [policy_checkpoints.lower_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
     np.testing.assert_allclose([float(state.best_min_return) for state in lowered], [best, reset, best], rtol=1e-6)

@@ -1,3 +1,5 @@
+"""Pooling of runs: what is one group, what is a row, which baseline belongs to a variant."""
+
 import json
 
 import numpy as np
@@ -56,7 +58,7 @@ def test_the_same_seed_twice_is_rejected(tmp_path):
     assert str(error.value) == message
 
 
-def test_runs_that_differ_are_rows_of_their_own_named_by_what_differs(tmp_path):
+def test_runs_that_differ_are_separate_rows_named_by_the_difference(tmp_path):
     write_run(tmp_path / "a")
     write_run(tmp_path / "b", steps=200)
     write_run(tmp_path / "c", updates_per_step=2)
@@ -109,7 +111,7 @@ def test_rows_and_tasks_have_the_order_of_their_tables(tmp_path):
     assert found.tasks == ["cheetah", "walker", "humanoid", "brax:ant"]
 
 
-def test_what_is_incomplete_says_why(tmp_path):
+def test_incomplete_groups_have_notes(tmp_path):
     write_run(tmp_path / "a", curves=[[0, 1, 2], [0, 5, NAN]])
     write_run(tmp_path / "b", curves=[[0, 3]], seeds=[7], versions={"jax": "0.11.0"})
     group = only(collect([str(tmp_path)]))
@@ -119,11 +121,11 @@ def test_what_is_incomplete_says_why(tmp_path):
         "only evaluations up to step 50 count, because not all seeds have later ones",
         "seeds from runs with different versions: jax 0.10.2, 0.11.0",
     )
-    assert (group.score.mean, group.scored_at) == (3.0, 50)  # of all three seeds, and of no step that one has not
+    assert (group.score.mean, group.scored_at) == (3.0, 50)  # of all three seeds, at a step that all have
     np.testing.assert_array_equal(group.finals, [1, 5, 3])
 
 
-def test_means_over_intervals_count_what_all_seeds_measured(tmp_path):
+def test_means_over_intervals_count_only_those_that_all_seeds_measured(tmp_path):
     bias = [[9, 1, 3], [9, 2, NAN]]
     write_run(tmp_path, curves=[[0, 1, 2], [0, 1, 2]], q_std=[0.5, 0.75], more={"value_bias": bias})
     group = only(collect([str(tmp_path)]))

@@ -1,9 +1,11 @@
+"""Presets are valid for all algorithms and tasks."""
+
 import algorithm_rows
 import jax
 import pytest
 from probe_envs import constant_reward
 
-from experiments.commandline.presets import PRESETS, Row, preset_settings
+from experiments.commandline.presets import PRESETS, PresetRow, preset_settings
 from sqt_jax.algorithms import ALGORITHMS, make_config, make_train
 from sqt_jax.config import ConfigError
 
@@ -21,7 +23,7 @@ def test_every_preset_is_a_configuration_for_every_algorithm_and_environment(pre
 
 
 @algorithm_rows.every(NINE, fast=algorithm_rows.ONE_OF_EACH)
-def test_the_released_preset_makes_a_whole_run(algo):
+def test_the_released_preset_makes_a_complete_run(algo):
     """Traced, not compiled; the updates themselves: test_golden."""
     tiny = {"hidden": (5, 4), "embedding_size": 6, "steps": 1000, "warmup_steps": 300, "eval_every": 500}
     config = make_config(algo, "ant", **preset_settings("released", algo, "ant") | tiny)
@@ -38,7 +40,7 @@ def test_the_released_preset_makes_a_whole_run(algo):
 
 
 @pytest.mark.parametrize("algo", NOT_RELEASED)
-def test_nothing_is_released_of_the_other_rows(algo):
+def test_the_released_preset_rejects_the_other_rows(algo):
     with pytest.raises(ConfigError, match=f"--preset: released has no settings for {algo} on ant"):
         preset_settings("released", algo, "ant")
 
@@ -48,8 +50,8 @@ def test_paper_changes_nothing_and_quick_is_shorter():
     assert preset_settings("quick", "sac_sqt", "ant")["steps"] < 50_000
 
 
-def test_later_rows_win_where_their_patterns_match(monkeypatch):
-    rows = (Row({"steps": 1, "lr": 0.1}), Row({"steps": 2}, algo="td3*"), Row({"lr": 0.3}, env="ant"))
+def test_later_rows_override_earlier_ones_if_their_patterns_match(monkeypatch):
+    rows = (PresetRow({"steps": 1, "lr": 0.1}), PresetRow({"steps": 2}, algo="td3*"), PresetRow({"lr": 0.3}, env="ant"))
     monkeypatch.setitem(PRESETS, "layers", rows)
     assert preset_settings("layers", "sac", "walker") == {"steps": 1, "lr": 0.1}
     assert preset_settings("layers", "td3_sqt", "walker") == {"steps": 2, "lr": 0.1}

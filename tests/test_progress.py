@@ -1,3 +1,5 @@
+"""Time left, the live line, plain lines."""
+
 import io
 
 import numpy as np
@@ -89,7 +91,7 @@ def test_quiet_shows_messages_only(terminal):
     assert console.file.getvalue() == "member 3 diverged\n"
 
 
-def test_counting_without_a_terminal_is_a_line_now_and_then():
+def test_counting_without_a_terminal_prints_a_line_every_few_seconds():
     now, console = [0.0], make_console(terminal=False)
     with counting("drawing, pictures", 1_000, console, clock=lambda: now[0]) as tell:
         for done in range(1, 1_001):
@@ -101,7 +103,7 @@ def test_counting_without_a_terminal_is_a_line_now_and_then():
     ]
 
 
-def test_counting_on_a_terminal_is_a_line_that_goes():
+def test_counting_on_a_terminal_is_a_line_that_disappears():
     console = make_console(terminal=True)
     with counting("drawing, pictures", 1_000, console) as tell:
         tell(250)

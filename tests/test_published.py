@@ -1,3 +1,5 @@
+"""The published numbers that are stored with the package."""
+
 import json
 import tomllib
 from pathlib import Path
@@ -26,12 +28,12 @@ def test_figures_have_their_environment_version_and_source():
 
 
 @pytest.mark.parametrize(("env", "notes"), [("cheetah", 0), ("ant", 1), ("humanoid", 2)])
-def test_the_faults_of_the_archive_go_with_its_figures(env, notes):
+def test_the_figures_of_the_archive_have_its_faults_as_notes(env, notes):
     (figure,) = figures("td3", env, "released")
     assert len(figure.notes) == notes
 
 
-def test_the_fault_that_the_papers_figure_has():
+def test_the_fault_of_the_papers_figure():
     (figure,) = figures("td3", "humanoid", "SQT paper")
     assert figure.notes == (published.NEVER_LEARNS,)
     seeds = json.loads((published.FOLDER / "released_2023_scores.json").read_text())["humanoid"]["td3"]["max_per_seed"]

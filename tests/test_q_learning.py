@@ -1,4 +1,4 @@
-"""One step of each rule by hand, what the rules have in common, and what they do on small MDPs."""
+"""One step of each rule by hand, what the rules have in common, and their results on small MDPs."""
 
 import functools
 from fractions import Fraction
@@ -56,7 +56,7 @@ def test_sqts_target_by_hand(greedy, ddof, value):
     assert target(rule, coef=0.5, discount=0.0) == 1.0
 
 
-def test_what_the_next_action_is_greedy_for():
+def test_the_next_action_is_greedy_for_the_chosen_value():
     # minima 1, 0.9; means 3, 0.95; penalised with coef 1, ddof 0: 1 - 2, 0.9 - 0.05
     next_q = jnp.array([[1.0, 0.9], [5.0, 1.0]])
     values = [target(ta.algorithms(2, 0, greedy)["sqt"].rule, next_q, coef=1.0) for greedy in ta.GREEDY]
@@ -71,7 +71,7 @@ def learner_of(num_tables):
     return ta.Learner(tables, jnp.ones_like(tables), jnp.int32(0), jnp.int32(0))
 
 
-SEEN = ta.Transition(jnp.int32(0), jnp.int32(1), jnp.float32(1.0), jnp.int32(1), jnp.float32(1.0))
+SEEN = ta.TabularTransition(jnp.int32(0), jnp.int32(1), jnp.float32(1.0), jnp.int32(1), jnp.float32(1.0))
 
 
 def test_only_the_table_that_learns_changes_by_its_own_step_size():
@@ -85,14 +85,14 @@ def test_only_the_table_that_learns_changes_by_its_own_step_size():
     assert after.visits[1, 0, 1] == 2 and after.visits.sum() == before.visits.sum() + 1
 
 
-def test_all_tables_learn_where_the_data_are_shared():
+def test_all_tables_learn_if_the_data_are_shared():
     algorithm = ta.algorithms(3)["sqt_shared"]
     after = ta.learn(learner_of(3), SEEN, jnp.int32(1), jnp.float32(0), algorithm=algorithm, gamma=GAMMA, power=1.0)
     np.testing.assert_array_equal(after.tables[:, 0, 1], [(1 + 2.5) / 2, (5 + 2.5) / 2, (9 + 2.5) / 2])
     assert (after.visits[:, 0, 1] == 2).all() and after.visits.sum() == 12 + 3
 
 
-def test_identical_tables_have_no_penalty_and_equal_the_plain_algorithm():
+def test_identical_tables_have_no_penalty_and_equal_q_learning():
     same = jnp.broadcast_to(NEXT[0], (4, 3))
     for greedy in ta.GREEDY:
         for coef in (0.0, 0.5, 10.0):
@@ -116,7 +116,7 @@ def swept():
 
 
 @pytest.mark.parametrize("name", ta.algorithms())
-def test_everything_converges(name):
+def test_every_algorithm_converges(name):
     record, learner = swept()[name]
     error = record.error_max.mean(axis=0)  # [coefs, checkpoints]
     assert (error[:, 2] < 0.4 * error[:, 0]).all() and (error[:, 2] < 0.5).all()
@@ -177,7 +177,7 @@ def test_the_experience_has_the_models_frequencies():
     assert (begin[ended] == 0).all() and (begin[~ended] == seen.next_state[~ended]).all()
 
 
-def test_epsilon_greedy_takes_the_best_action_of_the_mean():
+def test_epsilon_greedy_chooses_the_best_action_of_the_mean():
     mdp = mdps.bias_chain(links=1, actions=4)
     model = ta.model_of(mdp, np.zeros((2, 4)))
     tables = jnp.zeros((2, 2, 4)).at[0, 0, 1].set(3.0).at[:, 0, 2].set(1.6)
@@ -207,7 +207,7 @@ def test_the_counter_example_holds_for_the_rule_itself():
 
 
 @pytest.mark.parametrize(("count", "ddof"), [(2, 1), (3, 0), (4, 1)])
-def test_the_search_finds_what_can_be_and_no_more(count, ddof):
+def test_the_search_finds_the_bound_and_nothing_above(count, ddof):
     values = contraction.values_of(ta.algorithms(count, ddof)["sqt"].rule)
     found = contraction.search(values, 0.5, count, 1, pairs=50_000).ratio
     bound = contraction.bound(0.5, count, ddof)
@@ -216,7 +216,7 @@ def test_the_search_finds_what_can_be_and_no_more(count, ddof):
     assert contraction.search(values, 0.5, count, 1, identical=True, pairs=50_000).ratio <= 1 + 1e-5
 
 
-def test_near_a_tie_of_the_choice_there_is_no_bound():
+def test_near_a_tie_the_ratio_is_unbounded():
     ratios = {
         greedy: [
             contraction.near_tie(contraction.values_of(ta.algorithms(2, 1, greedy)["sqt"].rule), 0.5, gap)
@@ -224,7 +224,7 @@ def test_near_a_tie_of_the_choice_there_is_no_bound():
         ]
         for greedy in ta.GREEDY
     }
-    # the std of the second action is sqrt(2): its penalty comes and goes with the choice
+    # the std of the second action is sqrt(2): its penalty depends on the choice
     assert ratios["min"] == pytest.approx([(2**0.5 / 2 - gap) / (2 * gap) for gap in (0.01, 0.001)], rel=1e-3)
     assert ratios["mean"][1] > 9 * ratios["mean"][0] > 300
     assert max(ratios["penalised"]) <= contraction.bound(0.5, 2, 1)

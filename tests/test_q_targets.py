@@ -1,4 +1,4 @@
-"""The conservative target: hand-worked numbers, the laws of the penalties, and what the target compiles to."""
+"""The conservative target: hand-worked numbers, the laws of the penalties, and its compiled program."""
 
 import re
 from functools import partial
@@ -142,7 +142,7 @@ def compiled_penalty(penalty, next_q, coef, ddof=1):
 
 @by_name
 @given(next_q=critics_values(), ddof=ddofs, inside=st.booleans())
-def test_coefficient_zero_is_the_plain_target_bit_for_bit(penalty, next_q, ddof, inside):
+def test_coefficient_zero_is_the_baselines_target_bit_for_bit(penalty, next_q, ddof, inside):
     plain = compiled_target(next_q, 0.0)
     ours = compiled_target(next_q, 0.0, penalty=penalty, ddof=ddof, inside=inside)
     np.testing.assert_array_equal(np.asarray(ours).view(np.uint32), np.asarray(plain).view(np.uint32))
@@ -213,14 +213,14 @@ def test_the_penalty_of_agreeing_critics_is_zero(penalty):
 
 
 @by_name
-def test_one_critic_has_no_penalty_to_give(penalty):
+def test_a_penalty_of_one_critic_is_rejected(penalty):
     with pytest.raises(ValueError, match="at least 2 critics"):
         penalty(jnp.ones((1, 4)), coef=0.5, ddof=0)
 
 
 @by_name
 @pytest.mark.parametrize(("n", "ddof"), [(2, 2), (2, 3), (5, 5), (2, -1)])
-def test_ddof_must_leave_something_to_divide_by(penalty, n, ddof):
+def test_ddof_must_be_below_the_number_of_critics(penalty, n, ddof):
     with pytest.raises(ValueError, match=f"below the number of critics .{n}."):
         penalty(jnp.ones((n, 4)), coef=0.5, ddof=ddof)
 
@@ -237,7 +237,7 @@ def test_nothing_is_differentiated_through_the_target(penalty):
 
 
 @pytest.mark.parametrize("inside", [True, False])
-def test_a_split_batch_has_the_whole_batchs_penalty(inside):
+def test_a_split_batch_has_the_complete_batchs_penalty(inside):
     key = jax.random.key(0)
     next_q, reward, discount = jax.random.normal(key, (3, 8)), jnp.arange(8.0), jnp.ones(8)
 
@@ -247,19 +247,19 @@ def test_a_split_batch_has_the_whole_batchs_penalty(inside):
 
     halves = next_q.reshape(3, 2, 4).swapaxes(0, 1), reward.reshape(2, 4), discount.reshape(2, 4)
     split = jax.jit(jax.vmap(partial(ours, axis_name="devices"), axis_name="devices"))(*halves)
-    whole = ours(next_q, reward, discount)
-    np.testing.assert_allclose(split.reshape(8), whole, rtol=1e-6)
+    complete = ours(next_q, reward, discount)
+    np.testing.assert_allclose(split.reshape(8), complete, rtol=1e-6)
     alone = jax.jit(jax.vmap(ours))(*halves)  # without the mean over devices, each half has a penalty of its own
-    assert np.abs(alone.reshape(8) - whole).max() > 1e-3
+    assert np.abs(alone.reshape(8) - complete).max() > 1e-3
 
 
-# Refused
+# Rejected
 
 
 @pytest.mark.parametrize(
     "shapes",
     [
-        {"reward": (3, 1)},  # torch's habit: a target of [B, B]
+        {"reward": (3, 1)},  # would broadcast to a target of [B, B]
         {"discount": (3, 1)},
         {"next_q": (3,)},  # one critic: the minimum would be over the batch
         {"next_q": (2, 4)},
@@ -268,16 +268,16 @@ def test_a_split_batch_has_the_whole_batchs_penalty(inside):
     ],
     ids=str,
 )
-def test_shapes_that_would_broadcast_to_something_else_are_refused(maybe_jit, shapes):
+def test_shapes_that_would_broadcast_silently_are_rejected(maybe_jit, shapes):
     shapes = {"next_q": (2, 3), "reward": (3,), "discount": (3,), "entropy_term": (3,)} | shapes
     values = {name: jnp.ones(shape) for name, shape in shapes.items()}
-    refused = r"\[N, B\], \[B\] and \[B\], not|have to leave \(3,\) of the values, not \(3, 3\)"
-    with jax.numpy_rank_promotion("allow"), pytest.raises(ValueError, match=refused):  # as users have it
+    rejected = r"\[N, B\], \[B\] and \[B\], not|have to leave \(3,\) of the values, not \(3, 3\)"
+    with jax.numpy_rank_promotion("allow"), pytest.raises(ValueError, match=rejected):  # JAX's default
         maybe_jit(lambda values: q_targets.td_target(**values, gamma=0.9))(values)
 
 
 @pytest.mark.parametrize("size", [0, 3])
-def test_a_subset_of_more_critics_than_there_are_is_refused(size):
+def test_a_subset_of_too_many_critics_is_rejected(size):
     with pytest.raises(ValueError, match=f"expected a subset of 1 to 2 critics, not {size}"):
         q_targets.random_subset(jax.random.key(0), 2, size)
 
@@ -286,14 +286,14 @@ def test_a_subset_of_more_critics_than_there_are_is_refused(size):
 
 
 @pytest.mark.parametrize("penalty", [None, *PENALTIES], ids=lambda p: getattr(p, "__name__", "plain"))
-def test_the_whole_target_compiles_to_a_handful_of_fused_kernels_without_copies(penalty):
-    def whole(next_q, reward, discount, coef, gamma):
+def test_the_target_compiles_to_a_few_fused_kernels_without_copies(penalty):
+    def complete(next_q, reward, discount, coef, gamma):
         bound = q_targets.no_penalty if penalty is None else partial(penalty, coef=coef)
         return target(next_q, reward, discount, gamma, penalty=bound)
 
     shapes = [(2, 256), (256,), (256,), (), ()]
     arguments = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    text = jax.jit(whole).lower(*arguments).compile().as_text()
+    text = jax.jit(complete).lower(*arguments).compile().as_text()
     entry = text[text.index("\nENTRY ") :]
     operations = re.findall(r"^\s+(?:ROOT )?%\S+ = \S+ ([\w-]+)\(", entry, flags=re.MULTILINE)
     kernels = [op for op in operations if op not in ("parameter", "constant", "bitcast", "tuple")]
@@ -304,6 +304,6 @@ def test_the_whole_target_compiles_to_a_handful_of_fused_kernels_without_copies(
 
 
 @pytest.mark.parametrize(("reduce", "expected"), [("mean", [2, 3.5]), ("min", [1, 2]), ("first", [3, 2])])
-def test_what_the_actor_maximises(maybe_jit, reduce, expected):
+def test_reductions_that_the_actor_maximises(maybe_jit, reduce, expected):
     q = jnp.array([[3.0, 2.0], [1.0, 5.0]])
     np.testing.assert_allclose(maybe_jit(lambda q: q_targets.ACTOR_REDUCTIONS[reduce](q))(q), expected)

@@ -27,7 +27,7 @@ BLOCKS = {page: BLOCK.findall(TEXT[page]) for page in PAGES}
 
 
 def programs():
-    """(page, code) of Python examples; one marked `continued` needs those before it, and comes with them."""
+    """(page, code) of Python examples; one marked `continued` is preceded by the example that it needs."""
     found = []
     for page, blocks in BLOCKS.items():
         for language, mark, code in blocks:
@@ -79,7 +79,7 @@ def name_of(example):
 
 
 def parsed(argv):
-    """The options of a command that looks at runs."""
+    """The options of a command that reads runs."""
     modules = (tables, plots, report, play)
     return {module.__name__.removeprefix("experiments."): module for module in modules}[argv[0]].parser().read(argv)
 
@@ -97,7 +97,7 @@ def test_python_examples_run(example, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_loop_of_ones_own_trains_td7_too():
+def test_the_loop_of_the_guide_trains_td7_too():
     (code,) = (code for _, code in PYTHON if "gymnasium.make" in code)
     for shown, td7 in [('"td3_sqt"', '"td7_sqt"'), ("replay.uniform", "lap.lap"), ("import replay", "import lap")]:
         assert code.count(shown) == 1
@@ -118,7 +118,7 @@ def test_commands_that_train_are_valid(argv, tmp_path):
 
 @pytest.mark.parametrize("argv", SWEEPS, ids=ids)
 def test_commands_that_train_grids_are_valid(argv):
-    """Its own flags, by the first thing that it rejects; the others are those of `run`."""
+    """The sweep's own flags, then those passed on to `run`."""
     command = [sys.executable, "-m", "experiments.sweep", *argv[1:], "--tasks=nowhere"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith("--tasks: "), done.stderr
@@ -127,7 +127,7 @@ def test_commands_that_train_grids_are_valid(argv):
 
 
 @pytest.mark.parametrize("argv", LOOKS, ids=ids)
-def test_commands_that_look_at_runs_are_valid(argv):
+def test_commands_that_read_runs_are_valid(argv):
     assert parsed(argv).runs
 
 

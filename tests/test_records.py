@@ -1,3 +1,5 @@
+"""The tables, summary and events of a run."""
+
 import csv
 import json
 from types import SimpleNamespace
@@ -93,7 +95,7 @@ def test_other_swept_scalars_are_further_columns(tmp_path):
     assert header.count("temperature") == 1 and header[-1] == "wall_seconds"
 
 
-def test_an_interval_without_an_evaluation_is_a_row_of_metrics_alone(tmp_path):
+def test_an_interval_without_an_evaluation_is_a_row_of_metrics_only(tmp_path):
     with Records(tmp_path / "run", members_of(), [], tensorboard=False) as records:
         records.report(report(20, None, {"loss": [1.0, 2.0]}))
     assert len((tmp_path / "run" / "evaluations.csv").read_text().splitlines()) == 1
@@ -183,7 +185,7 @@ def test_events_for_tensorboard_are_written_per_member(tmp_path):
 
 def test_only_a_runs_own_files_are_removed(tmp_path):
     path = tmp_path / "run"
-    records.remove_run(path)  # nothing there
+    records.remove_run(path)  # does nothing
     (path / "policy").mkdir(parents=True)
     for name in ("config.json", "evaluations.csv", "policy/member_0.npz"):
         (path / name).write_text("x")
@@ -192,7 +194,7 @@ def test_only_a_runs_own_files_are_removed(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["foreign file", "link", "linked folder", "no run"])
-def test_what_is_not_only_a_run_is_left_alone(tmp_path, kind):
+def test_a_folder_with_other_files_than_a_run_is_not_removed(tmp_path, kind):
     path, other = tmp_path / "run", tmp_path / "other"
     other.mkdir()
     (other / "thesis.tex").write_text("x")

@@ -58,7 +58,7 @@ def test_the_robot_is_in_view_and_its_ground_below(drawn, task):
     rows, columns = np.nonzero(robot)
     assert robot.sum() > 50
     assert abs(columns.mean() - WIDTH / 2) < WIDTH / 8 and abs(rows.mean() - HEIGHT / 2) < HEIGHT / 4
-    # the camera follows it: 30 m further it is in view still
+    # the camera follows it: 30 m further it is still in view
     there = abs(far - without).max(axis=2) > 30
     assert abs(np.nonzero(there[:, 10:-10])[1].mean() + 10 - WIDTH / 2) < WIDTH / 4
     # chequered below, the plain sky above
@@ -74,7 +74,7 @@ def test_the_default_camera_follows_the_robot():
         assert model.camera(view.fixedcamid).name == "track" and "track" in rendering.cameras(model)
 
 
-def test_a_model_without_that_camera_is_followed_as_well():
+def test_a_robot_without_a_tracking_camera_is_followed_too():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>")
     view = rendering.view_of(model)
     assert (view.type, view.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)

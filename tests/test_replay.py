@@ -1,4 +1,4 @@
-"""Uniform sampling over what the ring holds; the ring itself: test_ring.py."""
+"""Uniform sampling over the transitions in a ring; the ring itself: test_ring.py."""
 
 from functools import cache
 
@@ -25,7 +25,7 @@ def compiled(capacity=CAPACITY, batch=BATCH, min_mean_episode_length=1):
 
 
 def filled(init, insert, ends):
-    """A buffer after steps of one environment, of which `ends` says where its episodes end; and what it was given."""
+    """A buffer after steps of one environment, whose episodes end at `ends`; and the inserted transitions."""
     state, stream = init(), Stream(1)
     for over in ends:
         state = insert(state, stream.step([over]))

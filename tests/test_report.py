@@ -1,3 +1,5 @@
+"""The report command."""
+
 import re
 import subprocess
 import sys
@@ -17,7 +19,7 @@ def runs(tmp_path):
     return tmp_path / "runs"
 
 
-def test_a_report_is_one_file_that_asks_for_no_other(runs, tmp_path, capsys):
+def test_a_report_is_one_file_that_needs_no_other(runs, tmp_path, capsys):
     out = tmp_path / "new" / "report.html"
     assert main(["report", str(runs), f"--out={out}"]) == 0
     assert capsys.readouterr().out == f"{out}\n"
@@ -33,13 +35,13 @@ def test_a_report_is_one_file_that_asks_for_no_other(runs, tmp_path, capsys):
     assert not re.search(r"@import|url\((?!#)", text)
 
 
-def test_published_figures_where_asked(runs, tmp_path):
+def test_published_figures_with_reference(runs, tmp_path):
     out = tmp_path / "report.html"
     assert main(["report", str(runs), f"--out={out}", "--reference", "--statistic=mean"]) == 0
     assert "TD3 paper Table 1" in out.read_text() and "episode: mean over seeds" in out.read_text()
 
 
-def test_it_is_replaced_only_where_asked(runs, tmp_path, capsys):
+def test_a_report_is_replaced_only_with_overwrite(runs, tmp_path, capsys):
     out = tmp_path / "report.html"
     out.write_text("mine")
     assert main(["report", str(runs), f"--out={out}"]) == 2
@@ -51,13 +53,13 @@ def test_it_is_replaced_only_where_asked(runs, tmp_path, capsys):
     assert out.read_text().startswith("<!DOCTYPE html>")
 
 
-def test_what_was_left_out_is_said(runs, tmp_path, capsys):
+def test_runs_that_were_left_out_are_named(runs, tmp_path, capsys):
     (runs / "cheetah" / "td3" / "run" / "config.json").unlink()
     assert main(["report", str(runs), f"--out={tmp_path / 'report.html'}"]) == 0
     assert "td3/run has an evaluations.csv but no config.json" in capsys.readouterr().err
 
 
-def test_what_a_run_says_is_never_markup(runs, tmp_path):
+def test_texts_of_a_run_are_never_markup(runs, tmp_path):
     make_hostile(write_run(runs, "sac", name="<script>alert(3)</script>".replace("/", "")))
     make_hostile(write_run(runs, "sac", name="other", seeds=[1]))
     write_run(runs, "sac", name="third", seeds=[2])  # of other versions: a footnote
@@ -81,7 +83,7 @@ def test_what_a_run_says_is_never_markup(runs, tmp_path):
         (["runs", "--referense"], "--referense: unknown flag; did you mean --reference?"),
     ],
 )
-def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
+def test_an_invalid_command_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     assert main(["report", *argv]) == 2

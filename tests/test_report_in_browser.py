@@ -1,4 +1,4 @@
-"""The report as a browser shows it: figures are to be seen, tables can be sorted, and nothing hostile runs."""
+"""The report as a browser shows it: figures are visible, tables can be sorted, and nothing hostile runs."""
 
 import browser
 import pytest
@@ -56,7 +56,7 @@ def page(opened, report):
     assert [*opened.requests.values()] == [report.as_uri()]
 
 
-def test_every_figure_is_to_be_seen(page):
+def test_every_figure_is_visible(page):
     boxes = page.run(
         """[...document.querySelectorAll("figure")].map((figure) => {
           const svg = figure.querySelector("svg");
@@ -91,7 +91,7 @@ def test_a_click_sorts_ascending_then_descending_then_not(page):
     page.run(f"{HEADER}({place}).querySelector('button').click()")
     kind, up = state()
     assert kind == "ascending" and numbers(up) == sorted(numbers(before))
-    assert sorted(up) == sorted(before) and up[-1] == "-"  # none is lost, and what is empty stays below
+    assert sorted(up) == sorted(before) and up[-1] == "-"  # none is lost, and empty cells stay last
     page.run(f"{HEADER}({place}).querySelector('button').click()")
     kind, down = state()
     assert kind == "descending" and numbers(down) == numbers(up)[::-1] and down[-1] == "-"
@@ -99,7 +99,7 @@ def test_a_click_sorts_ascending_then_descending_then_not(page):
     assert state() == ("none", before)
 
 
-def test_words_are_sorted_and_another_header_takes_over(page):
+def test_words_are_sorted_and_another_header_replaces_the_first(page):
     table = "table-seeds"
     page.run(f"{HEADER}({[table, 'task']}).querySelector('button').click()")
     tasks = page.run(f"{COLUMN}({[table, 'task']})")
@@ -127,7 +127,7 @@ def test_keys_reach_and_work_the_headers(page):
 
 def test_nothing_hostile_has_run(page):
     assert page.run("[document.scripts.length, document.images.length]") == [1, 0]
-    # Nor would it, were it markup: the page's policy forbids it.
+    # Even as markup it would not run: the page's policy forbids it.
     image = "<img src=x onerror='window.hacked = 1' style='color: red'>"
     page.run(f'document.body.insertAdjacentHTML("beforeend", "{image}")')
     page.run("document.body.append(Object.assign(document.createElement('script'), {textContent: 'hacked = 1'}))")
@@ -138,7 +138,7 @@ def test_nothing_hostile_has_run(page):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out(page, scheme):
+def test_text_has_enough_contrast(page, scheme):
     page.set_scheme(scheme)
     text, ground = page.run("[getComputedStyle(document.body).color, getComputedStyle(document.body).backgroundColor]")
 
@@ -160,5 +160,5 @@ def test_commands_can_be_copied(page):
     assert page.run("getSelection().toString()").startswith("python -m experiments.report")
 
 
-def test_it_prints(page):
+def test_the_page_prints_completely(page):
     assert len(page.pdf()) > 100_000

@@ -64,7 +64,7 @@ def test_the_comparison_with_the_published_curves():
 def test_the_scores():
     """The column `score` of the table of runs; runs of several coefficients have their range."""
     checked = 0
-    header, *rows = rows_of(README.split("What the comparisons say")[0])
+    header, *rows = rows_of(README.split("\nThe comparisons: ")[0])
     for name, *cells in rows:
         shown = cells[header.index("score") - 1]
         seeds = read_run(RESULTS / name.strip("`"))

@@ -1,4 +1,4 @@
-"""A run that is resumed ends as if it had never stopped."""
+"""A resumed run ends like a run without a break."""
 
 import itertools
 import json
@@ -33,16 +33,16 @@ def resumed(out, *arguments):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def unbroken(tmp_path_factory):
     """The folder of a run without a break."""
-    out = tmp_path_factory.mktemp("whole")
+    out = tmp_path_factory.mktemp("unbroken")
     assert run(out, *MEMBERS) == 0
     return out
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="one device only")
-def test_a_run_goes_on_on_another_number_of_devices(tmp_path):
+def test_a_run_resumes_on_another_number_of_devices(tmp_path):
     assert run(tmp_path, *MEMBERS, "--steps=80", "--devices=2") == 0
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["devices"] == 2
     assert resumed(tmp_path, "--devices=1", "--steps=120") == 0
@@ -87,12 +87,12 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
     ],
     ids=["at the first evaluation", "in the warm-up", "at an evaluation", "between two", "at both"],
 )
-def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, capsys, whole, at, by):
+def test_an_interrupted_run_ends_like_a_run_without_a_break(tmp_path, monkeypatch, capsys, unbroken, at, by):
     interrupted(tmp_path, monkeypatch, at, by)
     assert f"--resume={path_in(tmp_path)}" in capsys.readouterr().out
     assert resumed(tmp_path) == 0
     assert f"resuming at step {at}" in capsys.readouterr().out
-    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
+    assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path))) == []
     summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
     assert (summary["status"], summary["env_steps"]) == ("done", 120)
     seconds = [float(row["wall_seconds"]) for row in rows_of(path_in(tmp_path) / "evaluations.csv")]
@@ -101,15 +101,15 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch, ca
     assert [entry["env_steps"] for entry in config["resumed"]] == [at]
 
 
-def test_the_same_command_with_resume_starts_the_run_and_goes_on_with_it(tmp_path, monkeypatch, whole):
+def test_the_same_command_with_resume_starts_the_run_and_resumes_it(tmp_path, monkeypatch, unbroken):
     interrupted(tmp_path, monkeypatch, 80)
     assert run(tmp_path, *MEMBERS, "--resume") == 0
-    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
+    assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path))) == []
     assert run(tmp_path / "new", *MEMBERS, "--resume") == 0
-    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path / "new"))) == []
+    assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path / "new"))) == []
 
 
-def test_a_finished_run_stays_as_it_is(tmp_path, whole):
+def test_a_finished_run_does_not_change(tmp_path, unbroken):
     assert run(tmp_path, *MEMBERS) == 0
 
     def content():
@@ -136,11 +136,11 @@ def test_a_finished_run_is_resumed_for_more_steps(tmp_path):
     assert (config["settings"]["steps"], config["replay_rows"]) == (200, 120)
     assert read_results(path)["rows"].shape[1] == 120
     assert int(read_results(path)["replay/inserted"]) == 200
-    # And again, with the number of steps that it has by now.
+    # Again, with its new number of steps.
     assert resumed(tmp_path, "--steps=200") == 0
 
 
-def test_a_diverged_member_stays_so(tmp_path, capsys):
+def test_a_diverged_member_stays_diverged(tmp_path, capsys):
     assert run(tmp_path, "--penalty_coef=0,1e38", "--checkpoint_every=20") == 3
     first = json.loads((path_in(tmp_path) / "summary.json").read_text())["diverged"]
     assert [entry["member"] for entry in first] == [2, 3]
@@ -148,12 +148,12 @@ def test_a_diverged_member_stays_so(tmp_path, capsys):
     assert resumed(tmp_path, "--steps=150") == 3
     summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
     assert summary["diverged"] == first and summary["status"] == "diverged"
-    assert "diverged at" not in capsys.readouterr().out  # it is no news
+    assert "diverged at" not in capsys.readouterr().out  # it was reported before
     late = [row for row in rows_of(path_in(tmp_path) / "evaluations.csv") if row["env_steps"] == "150"]
     assert [row["return_mean"] for row in late] == ["5.0", "5.0", "", ""]
 
 
-def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
+def test_a_run_without_checkpoints_is_rejected_and_not_changed(tmp_path, capsys):
     assert run(tmp_path, "--checkpoint_every=0") == 0
     assert not (path_in(tmp_path) / "checkpoint").exists()
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -164,8 +164,8 @@ def test_a_run_without_checkpoints_is_left_alone(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("reached", "rejected"), [(0, False), (50, False), (100, False), (150, True)])
-def test_a_run_that_lost_its_checkpoints_does_not_begin_again(tmp_path, reached, rejected):
-    """Evaluations every 50 steps, checkpoints every 50: of step 100 the row is there before the second checkpoint."""
+def test_a_run_that_lost_its_checkpoints_does_not_start_again(tmp_path, reached, rejected):
+    """Evaluations every 50 steps, checkpoints every 50: the row of step 100 exists before the second checkpoint."""
     path = write_run(tmp_path, curves=[range(reached // 50 + 1)])
     if not rejected:
         resume.check_may_restart(path, 50)
@@ -193,8 +193,8 @@ def test_tables_that_cannot_be_written_are_named_by_the_flag_of_their_folder(tmp
 
 
 @pytest.mark.parametrize("where", ["run_config.write", "Records", "train_loop"])
-def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monkeypatch, whole, where):
-    """Wherever: the same command with --resume is understood."""
+def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monkeypatch, unbroken, where):
+    """Wherever it died, the same command with --resume starts it again."""
 
     class Killed(BaseException):
         pass
@@ -207,10 +207,10 @@ def test_a_run_that_died_before_its_first_checkpoint_starts_again(tmp_path, monk
         patch.setattr(target, where.split(".")[-1], die)
         run(tmp_path, *MEMBERS)
     assert run(tmp_path, *MEMBERS, "--resume") == 0
-    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
+    assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path))) == []
 
 
-def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole):
+def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, unbroken):
     """The last step is made, and its evaluation is not."""
 
     def stopped(*arguments, stop, **options):
@@ -233,10 +233,10 @@ def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, whole
         patch.setattr(session, "train_loop", stopped)
         assert run(tmp_path, *MEMBERS) == 130
     assert resumed(tmp_path) == 0
-    assert differences(read_results(path_in(whole)), read_results(path_in(tmp_path))) == []
+    assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path))) == []
 
 
-def test_steps_that_cannot_be_are_rejected_and_the_run_stays_as_it_was(tmp_path, capsys):
+def test_invalid_steps_are_rejected_and_the_run_does_not_change(tmp_path, capsys):
     assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert resumed(tmp_path, "--steps=141") == 2
@@ -244,7 +244,7 @@ def test_steps_that_cannot_be_are_rejected_and_the_run_stays_as_it_was(tmp_path,
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatch):
+def test_a_resumed_run_has_no_summary_until_it_ends(tmp_path, monkeypatch):
     assert run(tmp_path, *MEMBERS) == 0
     seen = []
 
@@ -258,12 +258,12 @@ def test_while_a_run_goes_on_nothing_says_that_it_has_ended(tmp_path, monkeypatc
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
 
 
-def test_a_run_is_evaluated_on_the_physics_that_it_began_with(tmp_path, monkeypatch):
+def test_a_resumed_run_is_evaluated_on_the_physics_of_its_start(tmp_path, monkeypatch):
     """Whatever --eval_physics=auto would choose on this machine, which is mujoco on a CPU."""
     path = write_run(tmp_path, physics="mujoco", versions=run_config.versions())
     content = json.loads((path / "config.json").read_text())
     (path / "config.json").write_text(json.dumps(content | {"evaluated_on": "mjx"}))
-    for wanted in ({}, {"eval_physics": "auto"}):  # its own setting is still what it was
+    for wanted in ({}, {"eval_physics": "auto"}):  # its own setting has not changed
         run = resume.check(path, resume.read(path), wanted)
         assert {member.config.eval_physics for member in run.members} == {"mjx"}
         assert run.content["settings"]["eval_physics"] == "auto"
@@ -290,7 +290,7 @@ def test_the_command_resumes_on_every_physics(tmp_path, algo, env, physics):
         assert (done.returncode, done.stderr) == (0, "")
         return folder / env / algo / "run"
 
-    whole = train(tmp_path / "whole", "--steps=150", "--replay_capacity=90")
+    unbroken = train(tmp_path / "unbroken", "--steps=150", "--replay_capacity=90")
     train(tmp_path / "parts", "--steps=120", "--replay_capacity=90")
     parts = train(tmp_path / "parts", "--steps=150", "--replay_capacity=90", "--resume")
-    assert differences(read_results(whole), read_results(parts)) == []
+    assert differences(read_results(unbroken), read_results(parts)) == []

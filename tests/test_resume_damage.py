@@ -48,7 +48,7 @@ def flipped(path):
 
 
 def digit_changed(path):
-    """Another length of a table, in what is still a manifest."""
+    """Another length of a table, in a valid manifest."""
     text = path.read_text()
     changed = re.sub(r'("evaluations": \d*)(\d)', lambda match: match[1] + str((int(match[2]) + 1) % 10), text)
     assert changed != text
@@ -72,7 +72,7 @@ def manifest(**changes):
         path = folder / LAST / "manifest.json"
         content = json.loads(path.read_text())
         content |= {name: change(content[name]) for name, change in changes.items()}
-        del content["own_crc"]  # whoever changes it on purpose can make that fit
+        del content["own_crc"]  # a deliberate change can recompute it
         path.write_text(json.dumps(content | {"own_crc": manifests.own_crc(content)}))
 
     return damage
@@ -102,7 +102,7 @@ def of_another_step(folder):
 
 UNREADABLE = "its manifest.json cannot be read"
 MISSING = "rows of the replay are missing"
-# What is done to `checkpoint/`, and what is said of the last checkpoint.
+# Damage to `checkpoint/`, and the message about the last checkpoint.
 DAMAGED = {
     "manifest truncated": (lambda folder: truncated(folder / LAST / "manifest.json"), UNREADABLE),
     "manifest with another digit": (
@@ -144,7 +144,7 @@ def outside(path):
 
 
 def goes_on(finished, path, capsys, said):
-    """Resumes; what is said of the checkpoints is `said`, a pattern per line."""
+    """Resumes; the messages about checkpoints match `said`, a pattern per line."""
     before = outside(path)
     assert run(f"--resume={path}", "--quiet") == 0
     out, err = capsys.readouterr()
@@ -159,7 +159,7 @@ def goes_on(finished, path, capsys, said):
     assert outside(path) == before
 
 
-# Whole runs: of each kind of damage one is in the fast suite.
+# Complete runs: one of each kind of damage is in the fast suite.
 QUICK = ("manifest truncated", "rows elsewhere", "absurd size", "state flipped", "checkpoint a link", "rows missing")
 
 
@@ -186,9 +186,9 @@ def contents(path):
         (manifest(format=lambda _: 99), 0, "its checkpoints are of format '99', not "),
         (of_another_step, 0, "its checkpoint at step 60 is of step 40"),
     ],
-    ids=["no checkpoint is whole", "another format", "the state of another step"],
+    ids=["no checkpoint is valid", "another format", "the state of another step"],
 )
-def test_a_run_that_cannot_be_resumed_is_rejected_and_left_as_it_is(finished, tmp_path, capsys, damage, said, reason):
+def test_a_run_that_cannot_be_resumed_is_rejected_and_not_changed(finished, tmp_path, capsys, damage, said, reason):
     path = copied(finished, tmp_path)
     damage(path / "checkpoint")
     before = contents(tmp_path)
@@ -202,7 +202,7 @@ def test_a_run_that_cannot_be_resumed_is_rejected_and_left_as_it_is(finished, tm
     }
 
 
-def test_nothing_is_written_through_what_lies_in_the_way(finished, tmp_path, capsys):
+def test_nothing_is_written_through_links(finished, tmp_path, capsys):
     """Links under the names that a checkpoint has while it is written."""
     path = copied(finished, tmp_path)
     in_rows(Path.unlink)(path / "checkpoint")

@@ -21,7 +21,7 @@ CAPACITY = 12
 
 
 class Stream:
-    """What E environments give, with episodes that end where it is said: every number of a transition is its own."""
+    """Transitions of E environments whose episodes end at given steps; every number of a transition is unique."""
 
     def __init__(self, num_envs: int):
         self.num_envs, self.count = num_envs, 0
@@ -34,7 +34,7 @@ class Stream:
         return numbers.reshape(self.num_envs, O)
 
     def step(self, ends) -> Transition:
-        """The next transitions; `ends [E]` bool says whose episodes end with them."""
+        """The next transitions; `ends [E]` bool: the episodes that end with them."""
         following = self._fresh()
         step = Transition(
             obs=self.obs,
@@ -60,7 +60,7 @@ def one_row(ring, state, first):
 
 
 def filled(ring, insert, ends):
-    """A ring after steps with these `ends [steps, E]`, what it was given, and all that was said to be lost."""
+    """A ring after steps with these `ends [steps, E]`, the inserted transitions, and the numbers reported as lost."""
     state, stream, lost = ring.init(), Stream(ring.num_envs), []
     for row in ends:
         state, gone = insert(state, stream.step(row))
@@ -69,7 +69,7 @@ def filled(ring, insert, ends):
 
 
 def readable(ring, read, state) -> tuple[range, list[Transition]]:
-    """The numbers of the transitions that are there, and these."""
+    """The numbers of the available transitions, and the transitions."""
     numbers = range(int(ring.oldest(state)), int(state.inserted))
     batch = read(state, jnp.array(list(numbers), jnp.int32) % ring.capacity)
     return numbers, [Transition(*(leaf[i] for leaf in batch)) for i in range(len(numbers))]
@@ -106,7 +106,7 @@ def test_it_holds_the_newest_transitions_with_their_true_next_observations(num_e
 
 
 @given(num_envs=st.sampled_from([1, 3]), shortest=st.integers(2, 12), how_often=st.floats(0, 1), data=st.data())
-def test_where_episodes_are_shorter_than_was_said_old_transitions_go_and_none_is_wrong(
+def test_if_episodes_are_shorter_than_the_bound_old_transitions_are_lost_and_none_is_wrong(
     num_envs, shortest, how_often, data
 ):
     ring, insert, read = compiled(num_envs, shortest)
@@ -115,7 +115,7 @@ def test_where_episodes_are_shorter_than_was_said_old_transitions_go_and_none_is
     numbers, held = readable(ring, read, state)
     for number, transition in zip(numbers, held, strict=True):
         assert_same(transition, stream.transitions[number])
-    # What is gone is older than one that was lost, or than the ring.
+    # Missing transitions are older than a lost one, or than the ring.
     assert numbers.start == max(15 * num_envs - CAPACITY, max(lost, default=-1) + 1)
     # Ends that the newest step made are not written yet.
     later = ends.ravel()[: 14 * num_envs]
@@ -125,11 +125,11 @@ def test_where_episodes_are_shorter_than_was_said_old_transitions_go_and_none_is
     assert numbers.start <= max(15 * num_envs - CAPACITY, kept[0] if len(kept) == ring.final_capacity else 0)
 
 
-def test_room_for_final_observations_is_as_the_episodes_need_it():
+def test_room_for_final_observations_follows_from_the_episode_length():
     assert Ring(1000, O, A).final_capacity == 1001
     assert Ring(1_000_000, O, A, min_mean_episode_length=1000).final_capacity == 1001
     assert Ring(1000, O, A, num_envs=8, min_mean_episode_length=8).final_capacity == 133
-    assert Ring(2**30, O, A).final_capacity == 2**24  # whose numbers float32 can tell apart
+    assert Ring(2**30, O, A).final_capacity == 2**24  # indices up to there are exact in float32
 
 
 def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
@@ -144,7 +144,7 @@ def test_a_final_observation_that_the_next_episode_starts_with_needs_no_room():
 
 
 @pytest.mark.parametrize("width", [1, 3, 4])
-def test_other_than_one_transition_per_environment_is_rejected(width):
+def test_any_number_but_one_transition_per_environment_is_rejected(width):
     ring = Ring(CAPACITY, O, A, num_envs=2)
     with pytest.raises(ValueError, match=r"expected transitions of {'obs': \(2, "):
         ring.insert(ring.init(), Stream(width).step(np.zeros(width, bool)))
@@ -161,7 +161,7 @@ def test_transitions_of_other_sizes_are_rejected(field):
 
 
 @pytest.mark.parametrize("capacity", [0, 1, 3, 13])
-def test_a_capacity_that_an_insert_could_straddle_is_rejected(capacity):
+def test_a_capacity_that_is_no_multiple_of_an_insert_is_rejected(capacity):
     with pytest.raises(ValueError, match=f"capacity .{capacity}. must be a multiple of the rows inserted at once .2."):
         Ring(capacity, O, A, num_envs=2).init()
 
@@ -171,7 +171,7 @@ def test_a_capacity_that_an_insert_could_straddle_is_rejected(capacity):
 
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_members_have_their_own_of_every_field_except_the_number_of_inserted_transitions(num_envs):
-    """Two members, one whose episodes end at every step and one whose never do: as each would be without the other."""
+    """Two members, one whose episodes end at every step and one whose never do, equal the same members alone."""
     ring = Ring(CAPACITY, O, A, num_envs, min_mean_episode_length=4)
     axes = ring.member_axes()
     assert axes.inserted is None and set(axes._replace(inserted=0)) == {0}
@@ -191,7 +191,7 @@ def test_members_have_their_own_of_every_field_except_the_number_of_inserted_tra
             np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-# What checkpoints hold
+# Rows in checkpoints
 
 
 @given(
@@ -202,7 +202,7 @@ def test_members_have_their_own_of_every_field_except_the_number_of_inserted_tra
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=8)
-def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, steps, how_often, seed):
+def test_rows_saved_one_part_after_another_restore_everything(num_envs, shortest, steps, how_often, seed):
     ring, insert, read = compiled(num_envs, shortest)
     generator = np.random.default_rng(seed)
     state, stream, kept = ring.init(), Stream(num_envs), []
@@ -210,7 +210,7 @@ def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, ste
     for _ in range(steps):
         state, _ = insert(state, stream.step(generator.random(num_envs) < how_often))
         if generator.random() < 0.3 or int(state.inserted) - written > CAPACITY - num_envs:
-            for number in range(written, int(state.inserted)):  # a row at a time: none goes round the end
+            for number in range(written, int(state.inserted)):  # a row at a time: none crosses the end
                 kept.append(np.asarray(one_row(ring, state, number % CAPACITY)))
             written = int(state.inserted)
     for number in range(written, int(state.inserted)):
@@ -230,7 +230,7 @@ def test_rows_written_as_they_come_bring_everything_back(num_envs, shortest, ste
         np.testing.assert_array_equal(a, b)
 
 
-def test_without_rows_leaves_what_is_small():
+def test_without_rows_only_small_arrays_remain():
     ring = Ring(10_000, O, A, min_mean_episode_length=1000)
     state = ring.init()
     rest = ring.without_rows(state)

@@ -1,4 +1,4 @@
-"""What a lockstep step gives to the replay, and the bookkeeping of episodes."""
+"""The transitions of a lockstep step, and the counts of episodes."""
 
 import jax
 import jax.numpy as jnp

@@ -13,7 +13,7 @@ from sqt_jax.algorithms import make_config
 OUTPUT = {"tensorboard": True, "checkpoint_every": 20, "keep_checkpoints": 2}
 
 
-def test_default_name_tells_what_differs():
+def test_default_name_has_the_changed_settings():
     now = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
     assert default_name({}, now) == "20250102T030405Z"
     name = default_name({"preset": "quick", "hidden": (64, 32), "lr": 0.001, "seeds": (0, 1)}, now)
@@ -22,7 +22,7 @@ def test_default_name_tells_what_differs():
 
 
 def members_of(algo="sac_sqt", seeds=(3, 1), sweep=None, **settings):
-    """Members and the names of what is swept."""
+    """Members and the names of the swept settings."""
     sweep = sweep or {}
     small = {"hidden": (8, 4), "steps": 60, "warmup_steps": 20, "batch_size": 8}
     configs = [
@@ -62,9 +62,9 @@ def test_seeds_vary_fastest():
     assert swept == ["lr"]
 
 
-def test_settings_of_a_run_have_what_is_swept_as_values():
+def test_settings_of_a_run_have_the_swept_values_as_tuples():
     members, swept = members_of(seeds=(3, 1), sweep={"lr": (0.1, 0.2), "tau": (0.5, 0.25)})
-    settings = run_config.settings_of(members, swept)
+    settings = run_config.all_settings(members, swept)
     assert (settings["seeds"], settings["lr"], settings["tau"]) == ((3, 1), (0.1, 0.2), (0.5, 0.25))
     assert settings.keys() == members[0].config.flat().keys() | {"seeds"}
     assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)
@@ -112,7 +112,7 @@ def test_every_process_that_resumed_a_run_is_recorded(tmp_path):
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_what_describes_no_run_is_rejected(tmp_path, change, message):
+def test_an_invalid_config_json_is_rejected(tmp_path, change, message):
     _, _, content = written(tmp_path, "swept")
     run_config.write(tmp_path, content | change)
     with pytest.raises(run_config.InvalidRunConfig, match=message) as error:
@@ -140,7 +140,7 @@ def test_a_damaged_environment_of_ones_own_is_rejected(tmp_path, settings, own_e
         run_config.read(tmp_path)
 
 
-def test_what_json_has_no_word_for_is_not_written(tmp_path):
+def test_nan_and_infinity_are_not_written(tmp_path):
     _, _, content = written(tmp_path, "plain")
     with pytest.raises(ValueError):
         run_config.write(tmp_path, content | {"lr": float("nan")})

@@ -1,3 +1,5 @@
+"""Details of a run for the report."""
+
 import json
 
 import pytest
@@ -11,7 +13,7 @@ NAN = float("nan")
 
 
 def details(path, **content):
-    """Of a run whose config.json also has `content`; None is taken out."""
+    """Details of a run whose config.json also has `content`; keys with None are removed."""
     file = path / "config.json"
     changed = json.loads(file.read_text()) | content
     file.write_text(json.dumps({name: value for name, value in changed.items() if value is not None}))
@@ -19,7 +21,7 @@ def details(path, **content):
     return run_details.read(path, members)
 
 
-def test_what_config_json_says(tmp_path):
+def test_details_from_config_json(tmp_path):
     found = details(
         write_run(
             tmp_path, "td3_sqt", curves=[[0, 1, 2], [0, 3, 2]], seeds=[4, 7], versions={"jax": "1", "brax": None}
@@ -59,7 +61,7 @@ def test_what_config_json_says(tmp_path):
     ]
 
 
-def test_what_is_swept_and_what_diverged(tmp_path):
+def test_swept_settings_and_diverged_members(tmp_path):
     swept = {"penalty_coef": (0.1, 0.5)}
     found = details(write_run(tmp_path, "td3_sqt", curves=[[0, 1, NAN], [NAN, NAN, NAN]], swept=swept))
     assert found.settings[0] == ("penalty_coef", "0.1, 0.5", "0.5")
@@ -109,7 +111,7 @@ def test_an_environment_has_the_name_that_it_has_in_the_tables(tmp_path):
 
 
 @pytest.mark.parametrize("command", [None, [], ["run"], "run --algo=td3", ["run", 3], {"a": 1}])
-def test_what_is_not_recorded_is_said(tmp_path, command):
+def test_missing_records_are_named(tmp_path, command):
     found = details(write_run(tmp_path), command=command, device=3)
     assert found.commands[0].text is None and "no command that can be repeated" in found.commands[0].note
     assert {found.facts[name] for name in ("began", "device", "commit")} == {"not recorded in config.json"}
@@ -127,7 +129,7 @@ def test_what_is_not_recorded_is_said(tmp_path, command):
         ("{", "not known: summary.json cannot be understood", None),
     ],
 )
-def test_how_it_ended(tmp_path, summary, status, took):
+def test_how_a_run_ended(tmp_path, summary, status, took):
     path = write_run(tmp_path)
     if summary is not None:
         (path / "summary.json").write_text(summary)

@@ -1,3 +1,5 @@
+"""Runs of algorithms that this version does not know."""
+
 import json
 
 import pytest

@@ -1,4 +1,4 @@
-"""What a process sets before JAX starts. In processes of their own: in this one it has started."""
+"""Settings that are made before JAX starts. Tested in new processes, because it has started in this one."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ print(len(jax.local_devices()))
 
 
 def devices_of_a_run(*arguments):
-    """How many its members lie on, and how many there are."""
+    """The number of devices that the members use, and of all devices."""
     command = [sys.executable, "-c", PROGRAM, *arguments]
     found = subprocess.run(
         command, check=True, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, cwd=ROOT
@@ -42,7 +42,7 @@ def test_a_processor_is_a_device_for_each_member(tmp_path):
     assert devices_of_a_run(*run) == (members, members)
 
 
-def test_a_processor_is_a_device_for_each_member_of_a_run_that_goes_on(tmp_path):
+def test_a_processor_is_a_device_for_each_member_of_a_resumed_run(tmp_path):
     members = 2 * usable_cores() + 1
     path = test_plan.begun(tmp_path, "a", "--replay_capacity=10000", seeds(members))
     assert devices_of_a_run(f"--resume={path}") == (members, members)

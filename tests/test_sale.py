@@ -95,7 +95,7 @@ def test_layers_start_within_one_over_the_root_of_the_fan_in_and_critics_apart(p
         assert len(np.unique(np.asarray(leaf).reshape(N, -1), axis=0)) == N
 
 
-# What they compute
+# Values
 
 
 def norm(x):
@@ -138,7 +138,7 @@ def test_the_encoder_normalises_zs_and_not_zsa(maybe_jit, params):
     assert not np.any(np.isclose(np.abs(zsa).mean(axis=-1), 1, rtol=1e-2))
 
 
-def test_the_actor_sees_the_normed_observation_beside_zs(maybe_jit, params):
+def test_the_actor_sees_the_normed_observation_and_zs(maybe_jit, params):
     action = maybe_jit(ACTOR.apply)(params[1], OBS, ZS)
     x = joined(norm(dense(params[1], "layer0", joined(OBS))), ZS)
     for name in ("layer1", "layer2"):
@@ -147,7 +147,7 @@ def test_the_actor_sees_the_normed_observation_beside_zs(maybe_jit, params):
     np.testing.assert_allclose(action, np.tanh(dense(params[1], "layer3", x)), rtol=1e-4, atol=1e-5)
 
 
-def test_each_critic_sees_zsa_before_zs_beside_the_normed_input(maybe_jit, params):
+def test_each_critic_sees_the_normed_input_then_zsa_then_zs(maybe_jit, params):
     q = maybe_jit(critics(N).apply)(params[2], OBS, ACTION, ZSA, ZS)
     assert q.shape == (N, B)
     for i in range(N):

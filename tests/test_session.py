@@ -1,7 +1,4 @@
-"""A run on an environment that is handed in: filed, recorded and resumed under the environment's own name.
-
-Needs `make_config` to accept an `Environment`, and `flags.parse(argv, needs_env=False)`.
-"""
+"""A run on an environment that is handed in: filed, recorded and resumed under the environment's own name."""
 
 import json
 
@@ -47,10 +44,10 @@ def test_the_run_is_filed_and_recorded_under_the_name_of_its_environment(out):
 
 
 def test_it_is_resumed_with_the_environment_and_ends_as_without_a_break(out, point):
-    path, whole = (out / name / "my-point-v0" / "td3_sqt" / "run" for name in ("part", "all"))
+    path, unbroken = (out / name / "my-point-v0" / "td3_sqt" / "run" for name in ("part", "all"))
     assert run(f"--resume={path}", "--steps=60", "--quiet", env=point) == 0
-    assert differences(read_results(whole), read_results(path)) == []
-    # By the same command, which now finds it finished.
+    assert differences(read_results(unbroken), read_results(path)) == []
+    # The same command now finds it finished.
     assert run(*NEW.split(), "--steps=60", f"--out={out / 'part'}", "--resume", env=point) == 0
 
 

@@ -16,7 +16,7 @@ def test_a_second_signal_ends_the_process_at_once(monkeypatch):
 
 
 def test_a_sigterm_that_comes_twice_at_once_is_one(monkeypatch):
-    """By a batch system and by `experiments.sweep`, which passes its own on."""
+    """Sent by a batch system and by `experiments.sweep`, which forwards its own."""
     codes, now = [], []
     monkeypatch.setattr(signals.os, "_exit", codes.append)
     monkeypatch.setattr(signals.time, "monotonic", lambda: now[-1])

@@ -1,3 +1,5 @@
+"""Scores, IQM, improvements and bootstrap intervals, by hand and by their laws."""
+
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +50,7 @@ def test_iqm_by_hand():
 
 
 @given(SEEDS, st.floats(-100, 100), st.floats(0.01, 100), st.randoms(use_true_random=False))
-def test_iqm_moves_and_scales_with_the_values_and_knows_no_order(values, shift, scale, random):
+def test_iqm_shifts_and_scales_with_the_values_and_ignores_their_order(values, shift, scale, random):
     tolerance = {"rtol": 1e-9, "atol": 1e-6}
     np.testing.assert_allclose(iqm(values + shift), iqm(values) + shift, **tolerance)
     np.testing.assert_allclose(iqm(values * scale), iqm(values) * scale, **tolerance)
@@ -87,14 +89,14 @@ def test_profile_by_hand():
 
 
 @given(SEEDS)
-def test_a_profile_falls_from_one_to_nothing(values):
+def test_a_profile_falls_from_one_to_zero(values):
     thresholds = np.linspace(values.min() - 1, values.max(), 20)
     profile = mean(exceeds(values, thresholds))
     assert profile[0] == 1.0 and profile[-1] == 0.0 and (np.diff(profile) <= 0).all()
 
 
 @given(hnp.arrays(float, st.integers(2, 12), elements=FINITE), st.sampled_from([mean, iqm]))
-def test_an_interval_contains_the_estimate_and_lies_within_the_values(values, statistic):
+def test_an_interval_contains_the_estimate_and_is_within_the_values(values, statistic):
     low, high = bootstrap(statistic, values, resamples=500)
     slack = 1e-9 * (1 + np.abs(values).max())
     assert values.min() - slack <= low <= statistic(values) + slack
@@ -110,7 +112,7 @@ def test_an_interval_of_many_normal_values_is_the_textbooks():
     )
 
 
-def test_an_interval_is_repeatable_and_knows_its_confidence():
+def test_an_interval_is_repeatable_and_depends_on_the_confidence():
     values = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     assert bootstrap(iqm, values) == bootstrap(iqm, values)
     wide, narrow = bootstrap(mean, values), bootstrap(mean, values, confidence=0.5)
@@ -118,7 +120,7 @@ def test_an_interval_is_repeatable_and_knows_its_confidence():
     assert bootstrap(mean, np.array([3.0])) == (3.0, 3.0)
 
 
-def test_strata_are_drawn_apart_and_what_lies_above_seeds_together():
+def test_strata_are_resampled_separately_and_leading_axes_together():
     # A constant stratum stays, whatever the other one draws.
     low, high = bootstrap(mean, np.array([0.0, 10.0]), np.full(3, 4.0))
     assert (low, high) == (2.0, 7.0)

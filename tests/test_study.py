@@ -1,3 +1,5 @@
+"""The steps after which the tabular study measures."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""The rows and the legend of the tabular study."""
+
 from pathlib import Path
 
 from made_curves import curves
@@ -11,7 +13,7 @@ def test_the_committed_table_has_todays_legend():
     assert "there are many intervals is not corrected for" in table.read_text(encoding="utf-8")
 
 
-def test_rows_that_are_all_alike_are_one():
+def test_equal_rows_are_shown_as_one():
     found = summary.learning_rows({("grid", "sqt_shared"): curves((0.0, 0.5), 2), ("grid", "q_learning"): curves()})
     assert [row[:3] for row in found] == [("grid", "sqt_shared", "all alike"), ("grid", "q_learning", "-")]
     assert all(len(row) == len(summary.HEADER) for row in found)

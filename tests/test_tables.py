@@ -1,3 +1,5 @@
+"""The tables command."""
+
 import csv
 import subprocess
 import sys
@@ -40,7 +42,7 @@ def test_every_format_is_shown(runs, capsys, name):
     assert sign[name] in shown
 
 
-def test_every_format_is_written_and_replaced_only_where_asked(runs, tmp_path, capsys):
+def test_every_format_is_written_and_replaced_only_with_overwrite(runs, tmp_path, capsys):
     out = tmp_path / "tables"
     assert main(["tables", str(runs), f"--out={out}"]) == 0
     assert f"written to {out}: 7 tables" in capsys.readouterr().err
@@ -72,7 +74,7 @@ def test_every_format_is_written_and_replaced_only_where_asked(runs, tmp_path, c
         (["runs", "--out=runs/cheetah/td3/run/config.json"], "expects a folder, which this is not"),
     ],
 )
-def test_bad_usage_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
+def test_an_invalid_command_is_one_line_and_writes_nothing(runs, tmp_path, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     assert main(["tables", *argv]) == 2

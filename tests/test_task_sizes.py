@@ -1,3 +1,5 @@
+"""Table 1, and the sizes of custom environments."""
+
 import json
 
 from made_runs import made_member, write_run

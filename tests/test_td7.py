@@ -99,7 +99,7 @@ def test_before_the_first_copy_the_bootstrapped_value_is_zero():
     batch = make_batch(0)
     target, terms = td_target(init(), batch, NO_NOISE)
     np.testing.assert_allclose(target, batch.reward - 0.99 * batch.discount * terms["penalty"], rtol=1e-5, atol=1e-6)
-    assert terms["penalty"] > 0  # the disagreement is of the critics, whatever the bounds
+    assert terms["penalty"] > 0  # the disagreement does not depend on the bounds
 
 
 def test_the_bounds_clip_the_reduced_value_before_the_penalty():
@@ -129,7 +129,7 @@ def test_the_running_bounds_are_those_of_all_targets_and_come_into_use_at_copies
 # An update
 
 
-def test_copies_are_hard_take_all_that_the_update_made_and_lag_in_the_encoders():
+def test_copies_are_hard_follow_the_update_and_lag_in_the_encoders():
     states = run(open_bounds(init()), 2 * PERIOD + 1)
     for k, (before, after) in enumerate(zip(states, states[1:], strict=False), start=1):
         assert not same(before.encoder, after.encoder)
@@ -154,7 +154,7 @@ def changed(states, other):
     }
 
 
-def test_what_the_encoder_learns_is_felt_one_copy_later_and_by_the_target_two():
+def test_the_encoders_learning_reaches_the_critics_one_copy_later_and_the_target_two():
     start = open_bounds(init())
     other = start._replace(encoder=init(1).encoder)
     first = changed(run(start, 2 * PERIOD + 1), run(other, 2 * PERIOD + 1))
@@ -168,7 +168,7 @@ def test_what_the_encoder_learns_is_felt_one_copy_later_and_by_the_target_two():
 
 
 def test_the_actor_climbs_the_mean_of_the_critics_that_the_update_has_made():
-    """Adam's first step has the sign of the gradient; a large rate tells the new critics from the old ones."""
+    """Adam's first step has the sign of the gradient; a large rate distinguishes the new critics from the old ones."""
     batch, before = make_batch(0), open_bounds(init())
     before = before._replace(scalars=before.scalars._replace(lr=jnp.float32(0.3)), fixed_encoder=init(1).encoder)
     after, _, _ = update_learner(before, batch, NO_NOISE, 0)
@@ -257,7 +257,7 @@ def by_hand(policy, obs):
     return ACTOR.apply(policy.actor, obs, ENCODER.zs(policy.encoder, obs))
 
 
-def test_the_snapshot_behaves_and_the_checkpoint_is_evaluated(three_policies):
+def test_the_snapshot_acts_and_the_checkpoint_is_evaluated(three_policies):
     state, obs = three_policies, make_batch(0).obs
     behaviour, evaluation = (AGENT.act(state, obs, KEY, deterministic=flag) for flag in (False, True))
     np.testing.assert_allclose(behaviour, by_hand(state.checkpoints.snapshot, obs), rtol=1e-5, atol=1e-6)
@@ -274,7 +274,7 @@ def test_the_exploration_noise_is_added_to_the_snapshots_action():
     assert abs(float(noise.mean())) < 0.005 and abs(float(noise.std()) - 0.1) < 0.005
 
 
-def test_learning_leaves_snapshot_and_checkpoint_alone(three_policies):
+def test_learning_does_not_change_snapshot_and_checkpoint(three_policies):
     before, after = three_policies, run(three_policies, PERIOD + 1)[-1]
     assert same(after.checkpoints.snapshot, before.checkpoints.snapshot)
     assert same(after.checkpoints.checkpoint, before.checkpoints.checkpoint)
@@ -302,7 +302,7 @@ def test_past_the_switch_of_gradient_steps_one_episode_does_not_end_an_assessmen
     assert late.checkpoints.assessments == 1
 
 
-def test_episodes_of_several_environments_are_refused(three_policies):
+def test_episodes_of_several_environments_are_rejected(three_policies):
     with pytest.raises(ValueError, match=r"td7 expects one environment: .* not \(2,\)"):
         AGENT.observe(three_policies, jnp.array([5.0, 6.0]), jnp.array([True, False]), 0)
 
@@ -322,7 +322,7 @@ MEMBERS, EPISODE = 3, 5
 
 
 def reward_is_the_action():
-    """Always the same observation and reward for the first action: a return is what the policy is worth."""
+    """Always the same observation and reward for the first action: a return identifies the policy."""
 
     def start(key):
         return jnp.zeros(()), jnp.array([0.3, -0.2])
@@ -334,7 +334,7 @@ def reward_is_the_action():
 
 
 class Trained(NamedTuple):
-    """A sweep of a short run, and what was seen of it after the warm-up and after each episode of the training."""
+    """A sweep of a short run, and its states after the warm-up and after each training episode."""
 
     agent: Agent
     sweep: Sweep
@@ -364,7 +364,7 @@ def trained():
 
 
 def test_the_warm_ups_episodes_are_not_assessed(trained):
-    """They are random actions' and would set the best minimum that the first policies have to reach."""
+    """Their returns are of random actions; they would set the minimum that the first policies have to reach."""
     assert np.all(trained.warm_metrics["train_episodes"] == 4)
     checkpoints = trained.warm.agent.checkpoints
     assert np.all(checkpoints.assessments == 0) and np.all(checkpoints.refreshes == 0)
@@ -395,7 +395,7 @@ def test_each_training_episode_is_assessed_by_the_rule(trained):
             best[i] = metrics["train_return"][i] if better else best[i]
             refreshes[i] += better
             assert same(new.checkpoint, old.snapshot if better else old.checkpoint)
-            assert not same(new.snapshot, old.snapshot)  # refreshed from a learner that goes on learning
+            assert not same(new.snapshot, old.snapshot)  # refreshed from a learner that continues to learn
         np.testing.assert_array_equal(metrics["policy_checkpoint_refreshes"], refreshes)
         np.testing.assert_array_equal(metrics["best_min_return"], best)
     assert np.any(refreshes < 12) and np.all(refreshes >= 2)  # both cases were seen
@@ -422,7 +422,7 @@ def test_the_replay_learns_its_priorities(trained):
 
 
 def test_training_refreshes_the_largest_priority_with_the_copies_of_the_targets(trained):
-    """One that no row has any more: rows that got it are drawn at once, and learn their own."""
+    """A largest priority that no row has any more: rows that got it are drawn at once and get their own."""
     state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(trained.final)  # training donates its state
     steps = int(state.gradient_steps)
     assert steps % 4 == 0

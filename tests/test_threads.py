@@ -11,7 +11,7 @@ import pytest
 from sqt_jax.envs.physics.threads import thread_pool, usable_cores
 
 
-def test_all_cores_count_if_the_system_does_not_say_which_may_be_used(monkeypatch):
+def test_all_cores_count_if_the_system_does_not_limit_them(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     assert usable_cores() == os.cpu_count()
 
@@ -54,7 +54,7 @@ def test_a_forked_child_has_threads_of_its_own():
     thread_pool(3).run(lambda: None, 3)
     child = os.fork()
     if child == 0:
-        signal.alarm(20)  # else a child that waits for its parent's threads would wait forever
+        signal.alarm(20)  # otherwise a child that waits for its parent's threads would wait forever
         seen = []
         thread_pool(3).run(numbered(seen.append), 3)
         os._exit(0 if sorted(seen) == [0, 1, 2] else 1)
@@ -73,5 +73,5 @@ def test_an_error_in_a_thread_is_raised_once_all_have_ended():
     with pytest.raises(RuntimeError, match="broken"):
         pool.run(numbered(work), 3)
     assert sorted(ended) == [0, 2]
-    pool.run(numbered(ended.append), 3)  # and they still work
+    pool.run(numbered(ended.append), 3)  # the threads still work
     assert sorted(ended) == [0, 0, 1, 2, 2]

@@ -33,7 +33,7 @@ def test_timed_calls_are_interleaved(monkeypatch):
     assert "".join(calls).endswith("ababab")
 
 
-def test_one_that_fails_drops_out_and_the_others_are_measured(monkeypatch):
+def test_a_loop_that_fails_is_left_out_and_the_others_are_measured(monkeypatch):
     now, calls = 0.0, {"a": 0, "b": 0, "c": 0}
 
     def run(name, last):

@@ -1,4 +1,4 @@
-"""The training program: counters, seeds, compilations, what the compiled text holds, learning on known values."""
+"""The training program: counters, seeds, compilations, the compiled text, learning on known values."""
 
 import functools
 import re
@@ -41,7 +41,7 @@ def start(config, sweep, seeds=(0, 1, 2), **swept):
 
 
 def advance(sweep, state, steps, learn):
-    """The state after so many steps, and what was measured in them."""
+    """The state after these steps, and the metrics over them."""
     state = sweep.advance(train.new_interval(state), steps, learn)
     return state, sweep.measure(state)
 
@@ -109,7 +109,7 @@ def test_diverged_physics_are_counted_and_never_reach_the_replay():
 @pytest.mark.parametrize("physics", ["mujoco", "mjx"])
 @pytest.mark.parametrize("task", envs.TASKS)
 def test_a_final_observation_is_kept_for_each_episode_and_no_other_step(task, physics):
-    """Were an episode's next observations not the same numbers in both places, each would take room."""
+    """If an episode's next observations were not the same numbers in both places, each would use room."""
     settings = {"hidden": (8, 8), "batch_size": 8, "steps": 1_200, "warmup_steps": 1_100, "physics": physics}
     config = algorithms.make_config("td3", task, **settings)
     sweep = train.make_sweep(algorithms.make_trainer(config))
@@ -138,14 +138,14 @@ def test_a_sweep_over_scalars_shares_one_compilation():
 def test_chunks_change_nothing_at_all(td3):
     config, _, sweep = td3
     state = sweep.advance(start(config, sweep), 40, False)
-    whole = sweep.advance(state, 20, True)
+    unbroken = sweep.advance(state, 20, True)
     state = sweep.advance(start(config, sweep), 25, False)
     for steps, learn in [(15, False), (3, True), (17, True)]:
         state = sweep.advance(state, steps, learn)
-    assert identical(whole, state) and identical(sweep.measure(whole), sweep.measure(state))
+    assert identical(unbroken, state) and identical(sweep.measure(unbroken), sweep.measure(state))
 
 
-def test_what_is_measured_is_of_the_interval(td3):
+def test_metrics_are_of_the_interval(td3):
     config, _, sweep = td3
     state, warm = advance(sweep, start(config, sweep), 40, False)
     parts = []
@@ -156,7 +156,7 @@ def test_what_is_measured_is_of_the_interval(td3):
     state, metrics = advance(sweep, state, 3, True)
     for name in ("critic_loss", "q_mean", "q_std"):
         np.testing.assert_allclose(metrics[name], np.mean([part[name] for part in parts], axis=0), rtol=1e-5)
-    # The actor learned in the second step alone: the others do not count.
+    # Only the second step updated the actor: the others do not count.
     np.testing.assert_allclose(metrics["actor_loss"], parts[1]["actor_loss"], rtol=1e-5)
     assert np.isnan(parts[0]["actor_loss"]).all() and np.isnan(warm["critic_loss"]).all()
     assert (metrics["train_episodes"] == 3).all() and (warm["train_episodes"] == 40).all()
@@ -211,7 +211,7 @@ def test_a_seed_trains_alone_as_in_a_sweep(algo):
 
 
 @algorithm_rows.every(PENALISED, fast=("td3_sqt_tuple",))
-def test_coef_0_trains_bit_identically_to_the_plain_algorithm_and_others_do_not(algo):
+def test_coef_0_trains_bit_identically_to_the_baseline_and_others_do_not(algo):
     plain = algo.removesuffix("_tuple").removesuffix("_sqt")
     trained = {}
     for name, coef in [(plain, 0.0), (algo, 0.0), (algo, 0.5)]:
@@ -232,7 +232,7 @@ def test_the_same_seeds_twice_are_bit_identical(td3):
     assert identical(*runs)
 
 
-def test_evaluation_leaves_the_state_alone_and_draws_new_starts_each_time(td3):
+def test_evaluation_does_not_change_the_state_and_draws_new_starts_each_time(td3):
     config, _, sweep = td3
     state, _ = advance(sweep, start(config, sweep), 40, False)
     copy = numbers(state)
@@ -288,7 +288,7 @@ def test_evaluation_steps_and_segments():
     assert train.segments(0, 20_000, odd) == [(3500, False), (6500, True)]
 
 
-def test_memory_estimate_is_the_size_of_what_is_held():
+def test_memory_estimate_is_the_size_of_replay_and_agents():
     config, _, sweep = make("td3")
     state = start(config, sweep)
     agent = sum(leaf.nbytes for leaf in numbers(state.agent))
@@ -298,7 +298,7 @@ def test_memory_estimate_is_the_size_of_what_is_held():
 
 
 def optimised(sweep, state):
-    """The sweep compiled for speed, where a test learns for long (conftest: tests compile fast by default)."""
+    """The sweep compiled for speed, for tests that train for long (conftest: by default tests compile quickly)."""
     return sweep._replace(advance=sweep.advance.lower(state, 1, True).compile({"xla_backend_optimization_level": 3}))
 
 
@@ -331,14 +331,14 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     agent = algorithms.agent_of(config, probe_envs.one_step())
     act = jax.vmap(lambda s: agent.views.policy_action(agent.views.policy(s), obs))
     np.testing.assert_allclose(np.median(act(state.agent), axis=0), obs, atol=0.1)
-    assert np.median(metrics["td_error"]) < 0.1  # targets are rewards, and these the true values
+    assert np.median(metrics["td_error"]) < 0.1  # targets are rewards, which are the true values
     assert (metrics["train_length"] == 1).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["td3", "sac"])
 def test_truncation_bootstraps_and_termination_does_not(algo):
-    """Endless reward 1 is worth 1 / (1 - gamma) where only the time limit ends episodes; 3 steps of it 1 + g + g²."""
+    """Endless reward 1 is worth 1 / (1 - gamma) where only the time limit ends episodes; 3 steps 1 + g + g²."""
     values = {}
     for env in (probe_envs.constant_reward, probe_envs.countdown):
         settings = LEARN | {"tau": 0.1} | ({"temperature": 0.001} if algo == "sac" else {})
@@ -354,36 +354,36 @@ def test_truncation_bootstraps_and_termination_does_not(algo):
     assert values[probe_envs.countdown] == pytest.approx((1 + 1.9 + 2.71) / 3, rel=0.1)
 
 
-def test_an_environment_may_call_its_fields_as_it_likes():
-    """`inserted` is a counter that members share in the replay, and each member's own in an environment."""
+def test_an_environment_may_have_any_field_names():
+    """`inserted` is a shared counter in the replay, and each member's own number in an environment."""
     config, _, sweep = make("td3", probe_envs.with_a_field_called_inserted)
     state, metrics = advance(sweep, start(config, sweep), 50, True)
     assert state.timestep.state.task.inserted.shape == (3, 1) and (metrics["train_episodes"] > 0).all()
 
 
-def test_a_member_that_diverges_is_frozen_and_the_others_do_not_notice(td3):
+def test_a_member_that_diverges_is_frozen_and_the_others_continue(td3):
     config, _, sweep = td3
-    whole, seeds = start(config, sweep, range(5)), range(5)
-    whole = sweep.advance(sweep.advance(whole, 40, False), 20, True)
+    healthy, seeds = start(config, sweep, range(5)), range(5)
+    healthy = sweep.advance(sweep.advance(healthy, 40, False), 20, True)
     hurt = start(config, sweep, seeds)
     hurt = sweep.advance(sweep.advance(hurt, 40, False), 20, True)
     before = jax.tree.map(lambda x: np.array(x), hurt.agent)  # copies: the memory is donated
     storage = hurt.replay.storage.at[2].set(jnp.nan)
     hurt = sweep.advance(hurt._replace(replay=hurt.replay._replace(storage=storage)), 30, True)
-    whole = sweep.advance(whole, 30, True)
+    healthy = sweep.advance(healthy, 30, True)
     np.testing.assert_array_equal(hurt.diverged_at, [-1, -1, 61, -1, -1])
     np.testing.assert_array_equal(hurt.agent.diverged, np.arange(5) == 2)
     others = np.array([0, 1, 3, 4])
     for name in ("actor", "critic", "target_actor", "target_critic", "actor_opt", "critic_opt"):
-        ours, theirs = (numbers(getattr(state.agent, name)) for state in (hurt, whole))
+        ours, theirs = (numbers(getattr(state.agent, name)) for state in (hurt, healthy))
         for a, b, frozen in zip(ours, theirs, numbers(getattr(before, name)), strict=True):
             np.testing.assert_array_equal(a[others], b[others])
             np.testing.assert_array_equal(a[2], frozen[2])
-    np.testing.assert_array_equal(hurt.timestep.obs[others], whole.timestep.obs[others])
+    np.testing.assert_array_equal(hurt.timestep.obs[others], healthy.timestep.obs[others])
     assert np.isfinite(hurt.timestep.obs).all()
 
 
-def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
+def test_the_bias_distinguishes_overestimation_from_underestimation(monkeypatch):
     """The true value is 5 everywhere. The largest of five critics overestimates, a strong penalty underestimates."""
     settings = {"ensemble_size": 5, "warmup_steps": 100, "lr": 3e-3, "tau": 0.1, "gamma": 0.8, "steps": 1_000}
     found = {}
@@ -407,8 +407,8 @@ def test_the_bias_tells_overestimation_from_underestimation(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["sac", "td7"])
-def test_critics_are_judged_by_the_policy_whose_values_they_estimate(algo):
-    """SAC's critics by its samples, entropy included; TD7's by the checkpoint, which is what evaluation plays."""
+def test_the_bias_is_measured_for_the_policy_whose_values_critics_estimate(algo):
+    """SAC's critics by its samples, entropy included; TD7's by the policy checkpoint, which evaluation plays."""
     small = {"embedding_size": 16} if algo == "td7" else {}
     config, _, sweep = make(algo, functools.partial(probe_envs.countdown, 3), **small)
     state = sweep.advance(start(config, sweep), 40, False)

@@ -24,8 +24,8 @@ def train(cell):
     return run.main(["experiments.run", *cell.command])
 
 
-def test_with_a_file_of_settings_the_run_itself_says_whether_it_is_finished(tmp_path, capsys):
-    """The file may have been edited since."""
+def test_with_config_the_run_itself_decides_whether_it_is_finished(tmp_path, capsys):
+    """The file may have been edited since the run started."""
     file, lines = tmp_path / "grid.yaml", []
     rest = [*TINY.replace("--steps=60", f"--config={file}").split(), "--checkpoint_every=20"]
     (cell, *_) = cells_of(GRID, (), (), tmp_path, rest)
@@ -92,7 +92,7 @@ def test_a_grid_is_trained_once(tmp_path):
     assert all(finished(cell) for cell in grid)
 
 
-def test_what_was_interrupted_is_resumed(tmp_path, monkeypatch):
+def test_an_interrupted_cell_is_resumed(tmp_path, monkeypatch):
     (cell, *_) = cells_of(GRID, (), (), tmp_path, [*TINY.split(), "--checkpoint_every=20"])
     lines = []
 
@@ -113,10 +113,10 @@ def test_a_cell_that_cannot_be_trained_ends_the_sweep(tmp_path):
     grid = cells_of(GRID, (), (), tmp_path, ["--steps=-1"])
     assert train_cells(grid, train, lines.append) == 2
     assert len(lines) == 2 and not any(tmp_path.iterdir())
-    assert lines[-1] == "td3 on ant: ended with exit code 2"  # the same command would end so again
+    assert lines[-1] == "td3 on ant: ended with exit code 2"  # no hint: the same command would fail again
 
 
-def test_a_diverged_member_does_not(tmp_path):
+def test_a_diverged_member_does_not_end_the_sweep(tmp_path):
     grid = cells_of(Grid(("td3_sqt",), ("ant",)), (), (), tmp_path, [*TINY.split(), "--penalty_coef=1e38"])
     lines = []
     assert train_cells(grid, train, lines.append) == 3

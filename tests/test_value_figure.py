@@ -1,3 +1,5 @@
+"""The figure of the tabular study."""
+
 import pytest
 from figure_reader import pixels_of
 from made_curves import curves
@@ -23,7 +25,7 @@ def test_an_algorithm_has_its_colour_and_an_mdp_its_column(tmp_path):
 def test_a_band_is_the_interval_and_only_the_axis_cuts_it():
     axes = Figure().add_subplot()
     found = curves(error=(9.0, 3.0, 1.0))
-    found.record.error_max[0] *= 8  # one seed far from the others: the interval reaches below 0
+    found.record.error_max[0] *= 8  # one seed far from the others: the interval extends below 0
     _draw(axes, "q_learning", found, "error_max")
     _style_axes(axes, "error_max")
     (band,) = axes.collections

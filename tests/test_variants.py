@@ -18,7 +18,7 @@ from sqt_jax.settings import Setting
 
 @pytest.fixture
 def td3_range(monkeypatch):
-    """A row as a user adds it: TD3 with a new penalty, under a name that says nothing about it."""
+    """A row as a user adds it: TD3 with a new penalty, under a name that does not mention it."""
     row = ALGORITHMS["td3_sqt"]
     check = Setting.check
     monkeypatch.setattr(Setting, "check", lambda self, value: value == "range" or check(self, value))
@@ -48,7 +48,7 @@ def test_a_new_row_is_compared_with_its_baseline(td3_range, tmp_path):
     assert [row[0] for row in cells(table_4(runs, False))] == ["td3_sqt_tuple"]  # the paper's two penalties only
 
 
-def test_a_new_row_has_its_baselines_colour_and_a_line_of_its_own(td3_range, monkeypatch, tmp_path):
+def test_a_new_row_has_its_baselines_colour_and_its_own_line(td3_range, monkeypatch, tmp_path):
     monkeypatch.setitem(ALGORITHMS, "other", ALGORITHMS[td3_range])
     names = ["td3", "td3_sqt", "td3_sqt_tuple", td3_range, "other"]
     for algo in names:

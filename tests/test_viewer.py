@@ -17,7 +17,7 @@ MODEL = load_model(TASKS["hopper"])
 
 
 class Window:
-    """Closed by its user after some pictures."""
+    """A window that its user closes after some pictures."""
 
     def __init__(self, pictures):
         self.left, self.shown, self.closed = pictures, [], False
@@ -35,7 +35,7 @@ class Window:
 
     def _draw(self):
         self.close_requested.wait(10)
-        time.sleep(0.1)  # it closes in its own time
+        time.sleep(0.1)  # closing takes a while
         self.closed = True
 
     def is_running(self):

@@ -1,4 +1,4 @@
-"""CheckpointStore per second: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
+"""Checkpoints per second: `python -m experiments.bench --suites=checkpoint --tasks=ant --members=5`."""
 
 import statistics
 import tempfile

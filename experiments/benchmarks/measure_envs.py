@@ -29,7 +29,7 @@ def bench_physics(
     Args:
       solver: name -> MJX's options `iterations` and `ls_iterations`.
     """
-    steps = {"MuJoCo alone": preparing(mujoco_steps, task, members)}
+    steps = {"MuJoCo without JAX": preparing(mujoco_steps, task, members)}
     steps |= {name: preparing(env_steps, task, members, name) for name in envs.PHYSICS if not envs.lacks(name)}
     steps["mjx, the file's iterations"] = preparing(
         env_steps, task, members, "mjx", iterations=None, ls_iterations=None

@@ -28,7 +28,7 @@ SAVED = 25_000  # rows of a checkpoint: the default interval
 
 
 class Memory(NamedTuple):
-    """Bytes."""
+    """Memory in bytes."""
 
     started: int  # the process with its imports, before the first array
     peak: int  # of the process during compilation, warm-up, training, evaluation and a checkpoint

@@ -84,7 +84,7 @@ def updates(algo: str, task: str, members: int, devices: int = 1, **settings: An
         return jax.lax.fori_loop(0, steps, body, state)
 
     run = jax.jit(layout.over_members(loop, (0, 0, 0, None), 0))
-    keys = layout.filled(member_keys(members))
+    keys = layout.padded(member_keys(members))
     state = jax.jit(layout.over_members(agent.init, (0,), 0))(keys)
     batch = jax.jit(layout.over_members(random_batch, (0,), 0))(keys)
     one_batch = jax.eval_shape(random_batch, jax.random.key(0))

@@ -18,7 +18,7 @@ from experiments.running import files
 HEADER = ("suite", "what", "members", "rate", "unit", "compile s", "GFLOP", "of the peak", "operations per step")
 # The reference of a ratio, by suite and physics.
 REFERENCES = {
-    ("physics", "mujoco"): "MuJoCo alone",
+    ("physics", "mujoco"): "MuJoCo without JAX",
     ("physics", "mjx"): "mjx, the file's iterations",
     ("loop", "mujoco"): "mjx",
     ("loop", "warp"): "mjx",

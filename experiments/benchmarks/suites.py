@@ -18,7 +18,7 @@ MORE_SUITES = ("growth", "memory")
 
 
 class Request(NamedTuple):
-    """What to measure; fields are the benchmark's flags of the same names, parsed."""
+    """The requested measurements; fields are the benchmark's flags of the same names, parsed."""
 
     suites: Sequence[str]
     tasks: Sequence[str]

@@ -1,1 +1,1 @@
-"""The command line: flags, files of settings, messages."""
+"""Command lines: flags, presets, YAML files of settings, messages."""

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from experiments.running import files
 
-# Exit codes of all commands.
+# Exit codes of all commands; their meaning: experiments/README.md.
 DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
@@ -57,6 +57,7 @@ class Parser(argparse.ArgumentParser):
         return options
 
     def error(self, message: str) -> NoReturn:
+        """Raises `UsageError` with argparse's message in this repository's form."""
         flag, _, rest = message.removeprefix("argument ").partition(": ")
         if "expected one argument" in rest:
             rest = _expectation(next(action for action in self._actions if flag in action.option_strings))
@@ -66,7 +67,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _expectation(action: argparse.Action) -> str:
-    """What a flag expects, taken from the message of its type for an empty text."""
+    """The words of a flag's type about the expected value, from its message for an empty text."""
     try:
         if callable(action.type):
             action.type("")

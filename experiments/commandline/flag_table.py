@@ -33,6 +33,8 @@ class OutputConfig:
 
 
 class Flag(NamedTuple):
+    """One flag: how its text is parsed, and its line in --help."""
+
     name: str
     parse: Callable[[str], Any] | None  # None: a switch
     expects: str
@@ -93,7 +95,7 @@ def _flag(about: Setting) -> Flag:
 
 
 def default_text(about: Setting) -> str:
-    """A setting's default, and those of the algorithms' rows that have another: `1; 2 for td3, td7`."""
+    """A setting's default, and the other defaults of algorithms' rows: `1; 2 for td3, td7`."""
     values: dict[str, Any] = {}
     for algo, row in ALGORITHMS.items():
         config = default_agent_config(algo)
@@ -112,7 +114,7 @@ def default_text(about: Setting) -> str:
 
 
 def _by_kind(texts: Mapping[str, str]) -> dict[str, str]:
-    """The same with fewer names: baselines if their variants agree with them, else endings if all of those agree."""
+    """The texts under fewer names: by baseline if its variants agree, else by ending (`_sqt`) if those agree."""
 
     def baseline(algo: str) -> str:
         return ALGORITHMS[algo].baseline or algo

@@ -1,7 +1,7 @@
 """A command line's text as `Options`.
 
-A flag that is not given is absent from the result: defaults belong to the algorithms. This module checks each flag by
-itself; `sqt_jax.make_config` checks them together.
+A flag that is not given is absent from the result: defaults belong to the algorithms. This module checks each flag
+separately; `sqt_jax.make_config` checks them together.
 """
 
 import math
@@ -77,7 +77,7 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
         else:
             absl_flags.DEFINE(_Parser(flag), flag.name, None, flag.help, flag_values=values)
     try:
-        rest = values(_with_resume_valued(argv), known_only=False)[1:]
+        rest = values(_with_resume_value(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
         hint = did_you_mean(f"--{error.flagname}", [f"--{flag.name}" for flag in known]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
@@ -94,8 +94,8 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     return {flag.name: values[flag.name].value for flag in known if values[flag.name].present}
 
 
-def _with_resume_valued(argv: Sequence[str]) -> list[str]:
-    """`--resume` alone, at the end or before another flag, as `--resume=LATEST`."""
+def _with_resume_value(argv: Sequence[str]) -> list[str]:
+    """The words with `--resume` changed to `--resume=LATEST` where no value follows it."""
     following = [*argv[1:], "-"]
     return [
         f"{word}={LATEST}" if word.lstrip("-") == "resume" and word != "resume" and after.startswith("-") else word

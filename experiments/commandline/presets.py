@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from sqt_jax.settings import ConfigError
 
 
-class Row(NamedTuple):
+class PresetRow(NamedTuple):
     """Settings for the algorithms and environments whose names match (`*` matches everything)."""
 
     settings: dict[str, Any]
@@ -16,17 +16,17 @@ class Row(NamedTuple):
     env: str = "*"
 
 
-# What the authors' released code trains under the names of TD3 and SAC: TD7's update around their actions, with an
+# The authors' released code trains TD7's update with TD3's or SAC's actions, under the names of TD3 and SAC, with an
 # encoder that is never trained.
 UNTRAINED_SALE = {"networks": "sale", "train_encoder": False, "value_clipping": False}
 
 # Later rows win over earlier ones.
-PRESETS: dict[str, tuple[Row, ...]] = {
-    # The paper's protocol is what the settings' own defaults say.
+PRESETS: dict[str, tuple[PresetRow, ...]] = {
+    # The defaults of the settings are the paper's protocol.
     "paper": (),
     # A few minutes on two cores: enough to see a run work from end to end, not to judge an algorithm.
     "quick": (
-        Row(
+        PresetRow(
             {
                 "steps": 6_000,
                 "warmup_steps": 1_000,
@@ -37,13 +37,13 @@ PRESETS: dict[str, tuple[Row, ...]] = {
             }
         ),
     ),
-    # The authors' released code (BUILD_NOTES.md, "What is trained").
+    # The authors' released code (BUILD_NOTES.md, "What is trained, in full").
     "released": (
-        Row(UNTRAINED_SALE | {"sampled_actor": True}, algo="td3*"),
-        Row(UNTRAINED_SALE | {"policy_delay": 2, "squashed_log_prob": False}, algo="sac*"),
-        Row({"sampled_actor": True, "updates_per_step": 2}, algo="td7*"),
-        Row({"penalty_coef": 1.0}, algo="td?_sqt*"),
-        Row({"penalty_coef": 1.0}, algo="sac_sqt*"),
+        PresetRow(UNTRAINED_SALE | {"sampled_actor": True}, algo="td3*"),
+        PresetRow(UNTRAINED_SALE | {"policy_delay": 2, "squashed_log_prob": False}, algo="sac*"),
+        PresetRow({"sampled_actor": True, "updates_per_step": 2}, algo="td7*"),
+        PresetRow({"penalty_coef": 1.0}, algo="td?_sqt*"),
+        PresetRow({"penalty_coef": 1.0}, algo="sac_sqt*"),
     ),
 }
 

@@ -27,7 +27,7 @@ DEADLINE = 600  # seconds for one process
 
 
 class Job(NamedTuple):
-    """What to train, and the folder for its files."""
+    """A training, and the folder for its files."""
 
     task: str  # of TASKS
     algo: str

@@ -1,1 +1,1 @@
-"""Finished runs as evidence: pooled over seeds, and shown as tables, figures and a page."""
+"""Reads finished runs, pools them over seeds, and shows them as tables, figures and a page."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 NOTHING = "-"
-# Said of every interval of a score: the maximum over evaluations is optimistic, and the interval does not show that.
+# A note on every interval of a score: it does not show the optimism of the maximum over evaluations.
 NOT_RESAMPLED = "the choice of the score's evaluation is not resampled"
 
 

@@ -30,8 +30,8 @@ class Comparison(NamedTuple):
     """A group and the group of the same task that it is compared with."""
 
     group: Group
-    other: Group | None  # None: there is none
-    note: str = ""  # why, where `other` is None
+    other: Group | None  # None: nothing to compare with
+    note: str = ""  # the reason if `other` is None
 
 
 def against_baseline(collected: Collected, reference: bool, name: str) -> ResultTable:
@@ -39,7 +39,7 @@ def against_baseline(collected: Collected, reference: bool, name: str) -> Result
 
     Args:
       reference: also show the paper's mean improvements.
-      name: of the table, and so what is compared: `table2_improvement` is the score, `table3_change` std_T.
+      name: of the table: `table2_improvement` compares the score, `table3_change` std_T.
     """
     score = name == "table2_improvement"
     what = "score" if score else "std_T"
@@ -89,7 +89,15 @@ def against_baseline(collected: Collected, reference: bool, name: str) -> Result
         caption += " Last columns: the means over the tasks that can be compared."
     caption += " In brackets: 95 % intervals by bootstrap over seeds, stratified by algorithm and task"
     caption += f"; {NOT_RESAMPLED}." if score else "."
-    return ResultTable(name, title, header, [lines] if lines else [], caption, notes.texts, records)
+    return ResultTable(
+        name=name,
+        title=title,
+        header=header,
+        sections=[lines] if lines else [],
+        caption=caption,
+        notes=notes.texts,
+        records=records,
+    )
 
 
 def variants_compared(
@@ -183,7 +191,7 @@ def _against(*strata: np.ndarray) -> dict[str, float | None]:
 
 
 def _percentage_notes(found: Mapping[str, float | None]) -> list[str]:
-    """Why there is no percentage, or no interval of it."""
+    """The reasons for a missing percentage or a missing interval."""
     if found["improvement_percent"] is None:
         return ["no percentage: the other mean is not positive"]
     if found["improvement_low"] is None and found["probability_low"] is not None:

@@ -47,7 +47,7 @@ MAX_LINES = 6
 
 
 class Style(NamedTuple):
-    """How a row's lines look."""
+    """Colour, line and marker of a row."""
 
     colour: str
     line: Any  # one of matplotlib's line styles
@@ -57,7 +57,7 @@ class Style(NamedTuple):
 class Panel(NamedTuple):
     """One pair of axes: some rows on one task."""
 
-    part: int  # a figure's parts are a baseline and its SQT variants each, or all rows; each part has one legend
+    part: int  # a part is a baseline with its SQT variants, or all rows; it has one legend
     rows: tuple[AlgorithmRow, ...]
     task: str
     axes: Axes
@@ -104,15 +104,18 @@ class Stars:
         self.labels: set[str] = set()
 
     def add(self, label: str, where: str, notes: Sequence[str]) -> None:
+        """Adds the notes of a row, each once; `where` names the cell."""
         for note in notes:
             self.labels.add(label)
             if f"* {where}: {note}" not in self.texts:
                 self.texts.append(f"* {where}: {note}")
 
     def starred(self, label: str) -> str:
+        """The row's label, with a star if it has notes."""
         return f"{label} *" if label in self.labels else label
 
     def lines(self, width: int, most: int = 8) -> list[str]:
+        """The first `most` notes, wrapped to `width` characters."""
         shown = [line for text in self.texts[:most] for line in textwrap.wrap(text, width)]
         return shown + ([f"... and {len(self.texts) - most} more"] if len(self.texts) > most else [])
 
@@ -161,7 +164,7 @@ def add_texts(
         kind: dict[str, Any] = {"handles": handles, "frameon": False, "fontsize": "small", "handlelength": 3}
         if len(last) == 1:
             figure.legend(loc="outside right center", **kind)
-        elif len(last) == len(panels):  # one task: the parts are side by side
+        elif len(last) == len(panels):  # one task: a row of panels, one per part
             panel.axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), **kind)
         else:
             panel.axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), **kind)

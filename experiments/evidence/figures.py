@@ -1,4 +1,4 @@
-"""Figures of runs. They do without pyplot, and so without global state and a display."""
+"""Figures of runs, drawn without pyplot: they need no global state and no display."""
 
 import io
 from collections.abc import Callable, Mapping
@@ -47,7 +47,7 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
     Args:
       table: the columns of evaluations.csv (`records.read_evaluations`), [rows] each.
     """
-    from experiments.running.records import groups, of_member, swept_columns  # brings JAX
+    from experiments.running.records import groups, of_member, swept_columns  # imports JAX
 
     figure = Figure(figsize=(11, 4.2), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
@@ -189,7 +189,7 @@ def file_contents(draw: Mapping[str, Callable[[], Figure | None]], kind: str) ->
 
 
 def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
-    """Draws with texts as they are: a dollar sign in a run's files starts no formula."""
+    """Draws without formulas: a dollar sign in a run's files is shown as it is."""
     with matplotlib.rc_context({"text.parse_math": False}):
         return draw()
 

@@ -1,4 +1,4 @@
-"""The report as one page: a summary, tables, figures, details of each run, and what is incomplete."""
+"""The report as one page: a summary, tables, figures, details of each run, and incomplete scores."""
 
 import re
 from collections import Counter
@@ -112,7 +112,7 @@ def _summary(content: Content) -> list[str | Element]:
     )
     if not _not_complete(content):
         return [f"{text} {ALL_COMPLETE}"]
-    link = element("a", "what is missing", href=f"#{_id('Incomplete')}")
+    link = element("a", "details", href=f"#{_id('Incomplete')}")
     return [f"{text} ", element("strong", "Some runs are incomplete", class_="incomplete"), ": ", link, "."]
 
 

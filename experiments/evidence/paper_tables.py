@@ -135,7 +135,15 @@ def seeds_table(collected: Collected) -> ResultTable:
                 )
     header = ["algorithm", "task", "return at the score's evaluation, by seed", "at the last one", "std_T"]
     caption = "The seeds' values from which the tables above are computed."
-    return ResultTable("seeds", "Seeds", header, [lines], caption, notes.texts, records)
+    return ResultTable(
+        name="seeds",
+        title="Seeds",
+        header=header,
+        sections=[lines],
+        caption=caption,
+        notes=notes.texts,
+        records=records,
+    )
 
 
 def _algorithms(
@@ -192,7 +200,15 @@ def _algorithms(
     texts = [caption, *_protocol_notes(rows), *map(_sentence, collected.notes)]
     if figures and not any(line.published for lines in sections for line in lines):
         texts.append("No published numbers for these algorithms and tasks.")
-    return ResultTable(name, title, header, sections, " ".join(texts), notes.texts, records)
+    return ResultTable(
+        name=name,
+        title=title,
+        header=header,
+        sections=sections,
+        caption=" ".join(texts),
+        notes=notes.texts,
+        records=records,
+    )
 
 
 def _score_cell(group: Group) -> tuple[tuple[str, ...], dict[str, Any], list[str]]:

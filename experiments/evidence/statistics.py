@@ -22,6 +22,8 @@ class Score(NamedTuple):
 
 
 class Interval(NamedTuple):
+    """An interval's ends, [...] each."""
+
     low: np.ndarray
     high: np.ndarray
 

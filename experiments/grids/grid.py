@@ -1,4 +1,4 @@
-"""The grids, the cells that they consist of, and the names of their runs."""
+"""The grids, their cells, and the names of the runs."""
 
 import hashlib
 import json
@@ -13,9 +13,9 @@ from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.suggestions import expects_one_of
 
-BASELINES = ("td3", "sac", "td7")
+PAPERS_BASELINES = ("td3", "sac", "td7")
 MAX_NAME = 200
-# Flags of experiments.run that each cell has its own value of.
+# Flags of experiments.run that the grid sets, differently for each cell.
 CELL_FLAGS = ("algo", "env", "out", "name", "resume", "overwrite")
 
 
@@ -27,17 +27,17 @@ class Grid(NamedTuple):
     flags: tuple[str, ...] = ()  # further flags of each run
 
 
-WITH_SQT = tuple(name for baseline in BASELINES for name in (baseline, f"{baseline}_sqt"))
+WITH_SQT = tuple(name for baseline in PAPERS_BASELINES for name in (baseline, f"{baseline}_sqt"))
 GRIDS = {
     "table2": Grid(WITH_SQT),
-    "table3": Grid(WITH_SQT),  # the same runs, of which the table has another statistic
-    "table4": Grid(tuple(f"{baseline}{suffix}" for baseline in BASELINES for suffix in ("_sqt", "_sqt_tuple"))),
-    "all": Grid(tuple(f"{baseline}{suffix}" for baseline in BASELINES for suffix in ("", "_sqt", "_sqt_tuple"))),
+    "table3": Grid(WITH_SQT),  # the same runs; the table shows another statistic
+    "table4": Grid(tuple(f"{baseline}{suffix}" for baseline in PAPERS_BASELINES for suffix in ("_sqt", "_sqt_tuple"))),
+    "all": Grid(tuple(f"{baseline}{suffix}" for baseline in PAPERS_BASELINES for suffix in ("", "_sqt", "_sqt_tuple"))),
     "alpha": Grid(("td3_sqt",), ("cheetah",), ("--penalty_coef=0,0.1,0.25,0.5,1",)),
 }
 
 
-class Cell(NamedTuple):
+class GridCell(NamedTuple):
     """One run of a grid: an algorithm on a task, with all seeds."""
 
     task: str
@@ -48,7 +48,7 @@ class Cell(NamedTuple):
 
 def make_cells(
     name: str | None, algos: Sequence[str], tasks: Sequence[str], out: Path, flags: Sequence[str]
-) -> list[Cell]:
+) -> list[GridCell]:
     """The cells of the grid `name`, checked.
 
     Args:
@@ -56,7 +56,7 @@ def make_cells(
       flags: of every run, as `--flag=value`.
 
     Raises:
-      UsageError: a name is unknown, or a flag is one that each cell has its own value of.
+      UsageError: a name is unknown, or a flag is one of `CELL_FLAGS`.
     """
     if name is None:
         raise UsageError(f"--grid: expects one of {', '.join(GRIDS)}")
@@ -77,7 +77,7 @@ def make_cells(
     return cells_of(GRIDS[name], algos, tasks, out, flags)
 
 
-def cells_of(grid: Grid, algos: Sequence[str], tasks: Sequence[str], out: Path, flags: Sequence[str]) -> list[Cell]:
+def cells_of(grid: Grid, algos: Sequence[str], tasks: Sequence[str], out: Path, flags: Sequence[str]) -> list[GridCell]:
     """The cells of a grid, task by task; arguments as in `make_cells`."""
     cells = []
     for task in tasks or grid.tasks:
@@ -85,12 +85,12 @@ def cells_of(grid: Grid, algos: Sequence[str], tasks: Sequence[str], out: Path, 
             run_flags = (*grid.flags, *flags)
             name = run_name(run_flags)
             command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name}", "--resume", *run_flags)
-            cells.append(Cell(task=task, algo=algo, path=out / task / algo / name, command=command))
+            cells.append(GridCell(task=task, algo=algo, path=out / task / algo / name, command=command))
     return cells
 
 
 def run_name(flags: Sequence[str]) -> str:
-    """A run's name, made of its flags, so that all grids find the same runs. Long names end in a hash of the flags."""
+    """A run's name, made of its flags, so that grids share their runs. A long name ends in a hash of the flags."""
     name = "_".join(word.lstrip("-").replace("/", "-") for word in sorted(flags)) or "default"
     if len(name) <= MAX_NAME:
         return name
@@ -98,7 +98,7 @@ def run_name(flags: Sequence[str]) -> str:
     return f"{name[: MAX_NAME - 13]}_{digest.hexdigest()[:12]}"
 
 
-def finished(cell: Cell) -> dict[str, Any] | None:
+def finished(cell: GridCell) -> dict[str, Any] | None:
     """The content of summary.json if the cell's run has ended, else None."""
     try:
         summary = json.loads((cell.path / "summary.json").read_text())
@@ -107,6 +107,6 @@ def finished(cell: Cell) -> dict[str, Any] | None:
         return None
 
 
-def needs_training(cell: Cell) -> bool:
-    """Whether a cell is not finished. One with a file of settings always counts: the run compares the file itself."""
+def needs_training(cell: GridCell) -> bool:
+    """Whether a cell has to be started. One with --config always is: the run itself compares the file's settings."""
     return any(word.startswith("--config=") for word in cell.command) or not finished(cell)

@@ -9,11 +9,11 @@ from types import FrameType
 from typing import Any
 
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED
-from experiments.grids.grid import Cell, finished, needs_training
+from experiments.grids.grid import GridCell, finished, needs_training
 from experiments.running.progress import format_seconds
 
 
-def train_in_process(cell: Cell) -> int:
+def train_in_process(cell: GridCell) -> int:
     """Trains a cell by `experiments.run` and returns its exit code.
 
     Its output goes to a file NAME.log.txt next to the run's folder; errors are also printed. SIGINT and SIGTERM reach
@@ -53,8 +53,8 @@ def train_in_process(cell: Cell) -> int:
 
 
 def train_cells(
-    cells: Sequence[Cell],
-    train: Callable[[Cell], int],
+    cells: Sequence[GridCell],
+    train: Callable[[GridCell], int],
     say: Callable[[str], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> int:

@@ -15,8 +15,8 @@ from sqt_jax.evaluate import evaluate_policy
 from sqt_jax.types import Environment
 
 
-class Starts(NamedTuple):
-    """Positions and velocities at the start of episodes, in units of the task's noise; the largest of all entries."""
+class StartComparison(NamedTuple):
+    """Differences of starts (positions and velocities), in units of the task's noise; the largest over all entries."""
 
     number: int
     mean: float  # |ours - theirs|
@@ -25,7 +25,7 @@ class Starts(NamedTuple):
     p_value: float  # of the Kolmogorov-Smirnov test, times the number of entries
 
 
-class Episodes(NamedTuple):
+class EpisodeComparison(NamedTuple):
     """Complete episodes of one policy with random weights, from each side's own starts."""
 
     number: int
@@ -35,7 +35,7 @@ class Episodes(NamedTuple):
     return_p_value: float
 
 
-def compare_starts(name: str, count: int) -> Starts:
+def compare_starts(name: str, count: int) -> StartComparison:
     """Draws `count` starts of a task on each side; a `p_value` near 0 means that they differ."""
     task, env = TASKS[name], gymnasium_environment(name)
     keys = jax.random.split(jax.random.key(0), count)
@@ -52,7 +52,7 @@ def compare_starts(name: str, count: int) -> Starts:
     ends = np.abs(np.stack([ours.min(0) - theirs.min(0), ours.max(0) - theirs.max(0)]))
     # Normal velocities have no range.
     bounded = ends[:, : env.model.nq] if task.normal_velocity else ends
-    return Starts(
+    return StartComparison(
         number=count,
         mean=float(np.abs(ours.mean(0) - theirs.mean(0)).max()),
         std=float(np.abs(ours.std(0) / theirs.std(0) - 1).max()),
@@ -61,7 +61,7 @@ def compare_starts(name: str, count: int) -> Starts:
     )
 
 
-def compare_play(name: str, env: Environment, count: int) -> Episodes:
+def compare_play(name: str, env: Environment, count: int) -> EpisodeComparison:
     """Runs `count` episodes of a task on each side, ours in `env`; p-values near 0 mean that they differ."""
     size, actions = env.observation_size, env.action_size
     weights = np.random.default_rng(0).normal(size=(size, actions)).astype(np.float32) / np.sqrt(size)
@@ -70,7 +70,7 @@ def compare_play(name: str, env: Environment, count: int) -> Episodes:
         warnings.simplefilter("ignore")  # Gymnasium recommends v5 instead of v4
         theirs = gymnasium.make(TASKS[name].gymnasium_id)
     their_returns, their_lengths = evaluate_policy(lambda obs: np.tanh(obs @ weights), theirs, count)
-    return Episodes(
+    return EpisodeComparison(
         number=count,
         our_lengths=np.asarray(our_lengths),
         their_lengths=np.asarray(their_lengths),
@@ -79,7 +79,7 @@ def compare_play(name: str, env: Environment, count: int) -> Episodes:
     )
 
 
-def start_table(found: dict[str, Starts]) -> list[str]:
+def start_table(found: dict[str, StartComparison]) -> list[str]:
     """A Markdown table, as lines: a row per task."""
     lines = ["| task | starts | mean | std | range | p |", "|---|---|---|---|---|---|"]
     for name, row in found.items():
@@ -88,7 +88,7 @@ def start_table(found: dict[str, Starts]) -> list[str]:
     return lines
 
 
-def play_table(found: dict[str, Episodes]) -> list[str]:
+def play_table(found: dict[str, EpisodeComparison]) -> list[str]:
     """A Markdown table, as lines: a row per task."""
     lines = ["| task | episodes | length here | in Gymnasium | p, lengths | p, returns |", "|---|---|---|---|---|---|"]
     for name, row in found.items():

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from experiments.gymnasium_parity.distributions import (
-    Episodes,
-    Starts,
+    EpisodeComparison,
+    StartComparison,
     compare_play,
     compare_starts,
     play_table,
@@ -39,9 +39,9 @@ class TaskParity(NamedTuple):
     """The comparisons of one task."""
 
     steps: dict[str, StepErrors]  # by case
-    starts: Starts
+    starts: StartComparison
     episodes: EpisodeErrors | None  # None without the physics mujoco
-    played: Episodes | None  # likewise
+    played: EpisodeComparison | None  # likewise
 
 
 def physics_cases(physics: Sequence[str], solver: Mapping[str, dict[str, int]]) -> Cases:
@@ -83,7 +83,7 @@ def report(
       speeds: env steps per second of all members together, by task and case.
       states: as in `Counts`.
       members: number of environments in parallel in `speeds`.
-      machine: what the speeds depend on, by name.
+      machine: its properties by name (`benchmarks.machine`), on which the speeds depend.
       command: the command line that made the report.
     """
     about = ", ".join(f"{key}: {value}" for key, value in machine.items())

@@ -76,7 +76,7 @@ def compare_steps(name: str, env: Environment, count: int) -> StepErrors:
     placed = jax.jit(jax.vmap(env.set_physics))(jnp.asarray(rows.qpos), jnp.asarray(rows.qvel))
     after = jax.jit(jax.vmap(env.step))(placed, rows.action)
     task = TASKS[name]
-    first = rows.qpos.shape[1] - task.hidden
+    first = rows.qpos.shape[1] - task.unobserved
     velocities = slice(first, first + rows.qvel.shape[1])
     obs = np.asarray(after.final_obs, np.float64)
     expected = np.clip(rows.next_qvel, -task.max_speed, task.max_speed)

@@ -13,7 +13,7 @@ from sqt_jax.types import Array, Environment, TimeStep
 CHUNK = 50  # steps per call: few enough for a live line, enough to make the calls' cost negligible
 
 
-class Episode(NamedTuple):
+class PlayedEpisode(NamedTuple):
     """One episode of T steps."""
 
     shown: Any  # a pytree of [T, ...]: `look` of each state in which the policy acted
@@ -41,7 +41,7 @@ def play(
     num_episodes: int = 1,
     max_steps: int | None = None,
     watch: Callable[[int], None] = lambda steps: None,
-) -> list[Episode]:
+) -> list[PlayedEpisode]:
     """Runs E episodes in parallel, each to its own end, from the same starts as `evaluate` with this key.
 
     Args:
@@ -89,7 +89,7 @@ def play(
         watch(min(int(state.number), limit))
     shown = jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
     return [
-        Episode(
+        PlayedEpisode(
             shown=jax.tree.map(lambda x, i=i, length=length: x[:length, i], shown),
             total=float(state.totals[i]),
             length=int(length),
@@ -105,8 +105,8 @@ def configuration(timestep: TimeStep) -> tuple[Array, Array]:
     return timestep.state.task.qpos, timestep.state.task.qvel
 
 
-def ending(episode: Episode) -> str:
-    """How it ended, in words."""
+def ending(episode: PlayedEpisode) -> str:
+    """How the episode ended, in words."""
     if episode.terminated:
         return "terminated by the task"
     return "ended by the time limit" if episode.truncated else "cut off"

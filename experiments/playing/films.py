@@ -26,7 +26,7 @@ QUALITY = 18  # x264's rate factor: 0 is lossless, 23 its default; the loss is i
 
 
 def stride(period: float, name: str) -> int:
-    """N, for a film of format `name` in real time that shows every N-th of states `period` seconds apart."""
+    """The N for a real-time film of format `name` that shows every N-th state; states are `period` seconds apart."""
     exact = _fraction(period)
     if name != "gif":
         return math.ceil(1 / (MAX_RATE * exact))

@@ -10,9 +10,9 @@ from rich.console import Console
 
 from experiments.commandline.arguments import UsageError
 from experiments.playing import brax_pages, episodes, films, graphics, policies, rendering, viewer
-from experiments.playing.episodes import Episode
+from experiments.playing.episodes import PlayedEpisode
 from experiments.playing.play_flags import is_brax
-from experiments.playing.played_task import PlayedTask, make_task
+from experiments.playing.played_task import PlayedTask, make_played_task
 from experiments.running import files, progress, runtime
 from sqt_jax.rollout import Policy
 
@@ -35,7 +35,7 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     described = policies.read(run)
     returns = policies.final_returns(run, len(described.members))
     chosen = policies.choose(described, returns, options.seed, options.member)
-    task = make_task(chosen.member.config, options.physics, options.camera)
+    task = make_played_task(chosen.member.config, options.physics, options.camera)
     policy = policies.load(run, chosen, task.env)
     caption = policies.caption(described, chosen)
     print(caption)
@@ -48,25 +48,27 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     if options.video:
         film_episodes(task, played, options, caption, console)
     elif is_brax(task.env.name):
-        print("--video=FILE.html films it")
+        print("--video=FILE.html writes a film")
     elif not (graphics.has_display() and graphics.works("glfw")):
-        print("no display here: --video=FILE films it")
+        print("no display here: --video=FILE writes a film")
     else:
         show_episodes(task, played, options.camera)
 
 
-def play_episodes(task: PlayedTask, policy: Policy, options: argparse.Namespace, console: Console) -> list[Episode]:
+def play_episodes(
+    task: PlayedTask, policy: Policy, options: argparse.Namespace, console: Console
+) -> list[PlayedEpisode]:
     """Plays all episodes in parallel, with their progress on the console."""
     key = jax.random.key(options.start_seed)
     limit = min(options.steps or task.env.episode_length, task.env.episode_length)
-    if task.physics != "mujoco":  # which compiles in a second or two
+    if task.physics != "mujoco":  # mujoco compiles in a second or two
         console.print(f"compiling the episodes for {task.physics}", highlight=False)
     with progress.counting("playing, steps", limit, console) as watch:
         return episodes.play(task.env, policy, task.look, key, options.episodes, options.steps, watch)
 
 
 def film_episodes(
-    task: PlayedTask, played: Sequence[Episode], options: argparse.Namespace, caption: str, console: Console
+    task: PlayedTask, played: Sequence[PlayedEpisode], options: argparse.Namespace, caption: str, console: Console
 ) -> None:
     """Writes the film --video of the episodes, one after another in real time, and prints a line about it.
 
@@ -97,16 +99,16 @@ def film_episodes(
     )
 
 
-def show_episodes(task: PlayedTask, played: Sequence[Episode], camera: str) -> None:
+def show_episodes(task: PlayedTask, played: Sequence[PlayedEpisode], camera: str) -> None:
     """Shows the episodes in MuJoCo's viewer until it is closed.
 
     Raises:
-      UsageError: there cannot be a window.
+      UsageError: a window cannot be opened.
     """
     try:
         viewer.show(task.scene, [episode.shown for episode in played], task.period, camera)
     except RuntimeError as error:
-        raise UsageError(f"RUN: cannot be shown in MuJoCo's viewer ({error}); --video=FILE films it") from None
+        raise UsageError(f"RUN: cannot be shown in MuJoCo's viewer ({error}); --video=FILE writes a film") from None
 
 
 def counted(pictures: Iterable[np.ndarray], done: Callable[[int], None]) -> Iterator[np.ndarray]:

@@ -1,4 +1,4 @@
-"""The command line of `experiments.play`, and every check of it that needs neither JAX nor MuJoCo."""
+"""The command line of `experiments.play`, and the checks that need neither JAX nor MuJoCo."""
 
 import argparse
 import os
@@ -12,13 +12,13 @@ from experiments.running import files
 
 EXAMPLE = "python -m experiments.play RUN --video=film.mp4"
 DESCRIPTION = """\
-Plays a policy that a run has learned: prints the return of each episode, and films the same episodes in real time.
+Plays the policy of a run: prints the return of each episode, and films the same episodes in real time.
 Without --video they are shown in MuJoCo's viewer if there is a display. Of a run's members, the best at the last
 evaluation is played, unless --seed or --member names another. Without a display, MUJOCO_GL selects OpenGL's
 implementation; by default EGL or OSMesa, whichever works."""
 MAX_SEED = 2**32 - 1
 MAX_CONFIG_BYTES = 10_000_000
-BRAX = "brax:"
+BRAX = "brax:"  # `brax_envs.PREFIX`, whose module imports JAX
 
 
 def parser() -> Parser:

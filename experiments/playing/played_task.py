@@ -13,16 +13,16 @@ from sqt_jax.types import Environment, TimeStep
 
 
 class PlayedTask(NamedTuple):
-    """An environment to play in, and what its film needs."""
+    """An environment to play in, and the parts that its film needs."""
 
     env: Environment
     physics: str
     period: float  # seconds per control step
-    look: Callable[[TimeStep], Any]  # what is kept of a state, as in `episodes.play`
+    look: Callable[[TimeStep], Any]  # the part of a state to keep, as in `episodes.play`
     scene: Any  # a mujoco.MjModel; for brax:ENV Brax's own environment
 
 
-def make_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
+def make_played_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
     """The environment that a member was trained on.
 
     Args:

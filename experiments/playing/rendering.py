@@ -11,7 +11,7 @@ import numpy as np
 
 TRACKING = "track"  # the camera that follows the robot, in the models of Gymnasium's locomotion tasks
 
-DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees of our own camera, as of Gymnasium's
+DISTANCE, ELEVATION = 4.0, -20.0  # m and degrees of our own camera, the same as Gymnasium's
 SHADOW_TEXELS = 1024  # as fine as the pictures; MuJoCo's 4096 double the time of software rendering
 
 

@@ -144,7 +144,7 @@ class CheckpointStore:
 
     def _write_rows(self, replay: State, stop: int) -> None:
         capacity = self.replay.capacity
-        piece = max(1, PIECE_BYTES // (4 * self.layout.held * self._row_width))
+        piece = max(1, PIECE_BYTES // (4 * self.layout.padded_size * self._row_width))
         start = max(self._rows_end, stop - capacity)
         while start < stop:
             in_ring = start % capacity
@@ -210,7 +210,7 @@ class CheckpointStore:
         replay = state.replay
         for file in manifest.rows:
             rows = np.fromfile(self.path / file.name, np.float32).reshape(self.layout.members, -1, self._row_width)
-            replay = self._with_rows(replay, self.layout.filled(rows), jnp.int32(file.start % self.replay.capacity))
+            replay = self._with_rows(replay, self.layout.padded(rows), jnp.int32(file.start % self.replay.capacity))
         return state._replace(replay=replay)
 
     def _host_copy(self, leaf: Array, own: bool) -> np.ndarray:
@@ -222,8 +222,10 @@ class CheckpointStore:
         """`array` or zeros on the devices, of the shape of `like` except for the padding of members."""
         sharding = self.layout.sharding(0 if own else None)
         if array is None:
-            return jnp.zeros((self.layout.held, *like.shape[1:]) if own else like.shape, like.dtype, device=sharding)
-        placed = jax.device_put(self.layout.filled(array) if own else array, sharding)
+            return jnp.zeros(
+                (self.layout.padded_size, *like.shape[1:]) if own else like.shape, like.dtype, device=sharding
+            )
+        placed = jax.device_put(self.layout.padded(array) if own else array, sharding)
         return jax.random.wrap_key_data(placed) if _is_key(like) else placed
 
     def _without_rows(self, state: TrainState) -> TrainState:

@@ -21,7 +21,7 @@ class CsvTable:
     """Rows are in the file when `write` returns. If the disk is full they wait in memory for the next `write`.
 
     Args:
-      keep: bytes of an existing file to keep; what follows is cut off. 0: a new table.
+      keep: bytes of an existing file to keep; the rest is cut off. 0: a new table.
       columns: their names.
 
     Raises:
@@ -73,6 +73,7 @@ class CsvTable:
         return self._size
 
     def close(self) -> None:
+        """Closes the file. Waiting rows are lost."""
         os.close(self._file)
 
     def _line(self, row: Mapping[str, Any]) -> bytes:

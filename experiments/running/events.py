@@ -33,9 +33,11 @@ class Events:
         self._writer.flush()
 
     def add(self, values: Mapping[str, float], step: int) -> None:
+        """Writes a scalar event per name."""
         for name, value in values.items():
             self._writer.write_event(Event(wall_time=time.time(), step=step, summary=scalar(name, value)))
         self._writer.flush()
 
     def close(self) -> None:
+        """Closes the file."""
         self._writer.close()

@@ -14,7 +14,7 @@ MAX_DEPTH = 20  # of nested JSON
 
 
 class Busy(Exception):
-    """Another process has locked the folder; its number, if known."""
+    """Another process has locked the folder. `process` is its id, empty if unknown."""
 
     def __init__(self, process: str):
         super().__init__(process)

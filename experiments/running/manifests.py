@@ -39,6 +39,7 @@ class Step(NamedTuple):
 
     @property
     def name(self) -> str:
+        """Of the checkpoint's folder."""
         return f"step_{self.env_steps:010}" + (f".{self.repeat}" if self.repeat else "")
 
 
@@ -51,10 +52,13 @@ class Rows(NamedTuple):
 
     @property
     def name(self) -> str:
+        """Of the file."""
         return f"rows_{self.start:010}_{self.stop:010}.bin"
 
 
 class Manifest(NamedTuple):
+    """The content of a checkpoint's manifest.json."""
+
     state: dict[str, tuple[int, int]]  # size and CRC of each file below state/
     rows: list[Rows]
     position: Position
@@ -78,6 +82,7 @@ def rows_needed(rows: list[Rows], env_steps: int, capacity: int) -> list[Rows]:
 
 
 def write(path: Path, manifest: Manifest) -> None:
+    """Writes a manifest, completely or not at all. Raises `OSError`."""
     content: dict[str, Any] = {"format": FORMAT, "state": manifest.state, "rows": [file.name for file in manifest.rows]}
     content |= {"crc": [file.crc for file in manifest.rows], "position": manifest.position._asdict()}
     content |= {"lengths": manifest.lengths}

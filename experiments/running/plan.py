@@ -1,4 +1,4 @@
-"""From a command line to a plan: what is trained and where, checked before anything is written or compiled."""
+"""From a command line to a plan (settings, folder, devices), checked before anything is written or compiled."""
 
 import dataclasses
 import re
@@ -43,11 +43,12 @@ class Plan(NamedTuple):
 
     @property
     def train(self) -> TrainConfig:
+        """Of all members."""
         return self.config.train
 
 
 class _Target(NamedTuple):
-    """Which run a command line means."""
+    """The run that a command line refers to."""
 
     members: list[Member]
     swept: list[str]
@@ -84,7 +85,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         raise UsageError(f"--physics: {error}") from None
     output = _output(options, target.resumed, config.train)
     layout = _layout(count, output["devices"], typed=options.devices is not None)
-    needed, free = memory_estimate(config, layout.held, used_env), _free_memory(len(layout.devices))
+    needed, free = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
     if needed > free:
         raise UsageError(
             f"--replay_capacity={config.train.replay_capacity}: {count} members need about "
@@ -104,7 +105,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
 
 
 def _check_env(options: flags.Options, env: Environment | None) -> None:
-    """Flags that contradict an environment handed in, or that need one."""
+    """Rejects flags that contradict an environment handed in, or that need one."""
     for flag in ("physics", "eval_physics"):
         if env is not None and flag in options.settings:
             raise UsageError(f"--{flag}: has no effect with an environment handed in")
@@ -150,7 +151,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
         return _Target(members=members, swept=swept, path=path, resumed=None)
-    wanted = run_config.settings_of(members, swept) | run_config.sizes_of(env)
+    wanted = run_config.all_settings(members, swept) | run_config.sizes_of(env)
     if options.name is None:
         path, run = resume.latest(folder, wanted)
     elif not _exists(path / run_config.NAME):
@@ -242,12 +243,14 @@ def _is_valid_output(name: str, value: Any) -> bool:
 
 
 def not_only_a_run(path: Path) -> UsageError:
+    """The error for --overwrite of a folder that holds other files too."""
     return UsageError(
         f"--overwrite: {path} holds other things than a run; expects a folder that holds a run and nothing else"
     )
 
 
 def name_taken(path: Path) -> UsageError:
+    """The error for a name that another run has."""
     return UsageError(
         f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
     )

@@ -58,7 +58,7 @@ def check(path: Path, run: RunConfig, wanted: Mapping[str, Any], devices: int | 
 
 
 def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, RunConfig]:
-    """Of the runs in `folder` that have the settings `wanted`, the one that was started last, and its path.
+    """The run in `folder` that was started last of those with the settings `wanted`, and its path.
 
     Raises:
       UsageError: there is none.
@@ -81,13 +81,13 @@ def latest(folder: Path, wanted: Mapping[str, Any]) -> tuple[Path, RunConfig]:
 
 
 def check_may_restart(path: Path, checkpoint_every: object) -> None:
-    """Whether a run without any checkpoint may start at step 0 again.
+    """Checks that a run without any checkpoint may start at step 0 again.
 
-    It may if it died before its first checkpoint. A run that is past its second checkpoint has lost them: its tables
-    are not overwritten.
+    It may if it died before its first checkpoint. A run that is past its second checkpoint has lost them, and its
+    tables are not overwritten.
 
     Raises:
-      UsageError: it may not.
+      UsageError: it has lost its checkpoints, or never made any.
     """
     problem = f"--resume={path}: {EXPECTS_CHECKPOINTS}; it has none"
     if checkpoint_every == 0 or (path / "summary.json").exists():
@@ -111,7 +111,7 @@ def changed_versions(run: RunConfig) -> list[str]:
 
 def _problem(run: RunConfig, wanted: Mapping[str, Any]) -> str | None:
     """Why the run cannot be resumed with the settings `wanted`."""
-    own = run.content.get("own_env", {}) | run_config.settings_of(run.members, run.swept)
+    own = run.content.get("own_env", {}) | run_config.all_settings(run.members, run.swept)
     differing = [
         f"{name} (its own: {_text(own.get(name))}, now: {_text(value)})"
         for name, value in wanted.items()

@@ -2,8 +2,8 @@
 
 Keys: `settings` (of the first member), `preset`, `replay_rows` (the replay's capacity per member, fixed when the run is
 created), `evaluated_on` (the physics that `eval_physics` chose), `swept` (names), `members` (seed and swept values),
-`output` (`flag_table.OutputConfig`), `command`, `started`, `device`, `commit`, `versions`, `resumed` (an entry for each
-time), and `own_env` (sizes), only of a run whose environment was handed in.
+`output` (`flag_table.OutputConfig`), `command`, `started`, `device`, `commit`, `versions`, `resumed` (an entry per
+resumption), and `own_env` (sizes, only if the environment was handed in).
 """
 
 import json
@@ -60,14 +60,14 @@ def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member
     return [Member(seed, config) for config, seed in product(configs, seeds)]
 
 
-def settings_of(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
+def all_settings(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
     """All settings of a run by name; swept settings and `seeds` as tuples of their values."""
     settings = members[0].config.flat() | {"seeds": _values(member.seed for member in members)}
     return settings | {name: _values(getattr(m.config.agent, name) for m in members) for name in swept}
 
 
 def sizes_of(env: Environment | None) -> dict[str, int]:
-    """The sizes that config.json records of an environment handed in; none without one."""
+    """The sizes of an environment handed in, for config.json; empty without one."""
     return {"observation_size": env.observation_size, "action_size": env.action_size} if env else {}
 
 
@@ -154,6 +154,7 @@ def is_valid_own_env(own_env: Any, env: str, physics: str) -> bool:
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes config.json into the folder `path`, completely or not at all. Raises `OSError`."""
     with files.atomic_file(path / NAME) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
@@ -169,6 +170,7 @@ def resumed_content(
 
 
 def versions() -> dict[str, str | None]:
+    """The versions of `PACKAGES` by name; None: not installed."""
     return {name: _version(name) for name in PACKAGES}
 
 

@@ -1,4 +1,4 @@
-"""Settings that a process makes before JAX starts: the compilation cache, one XLA option, the number of CPU devices."""
+"""Settings of a process, made before JAX starts: the compilation cache, one XLA option, the number of CPU devices."""
 
 import os
 from contextlib import suppress
@@ -23,7 +23,7 @@ def cache_directory() -> Path:
 
 
 def prepare() -> None:
-    """Makes these settings; call before the first computation. Variables that the user has set take precedence."""
+    """Applies these settings; call before the first computation. Variables set by the user take precedence."""
     xla_flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in xla_flags:
         option = f"--xla_backend_extra_options={SMALL_LOOPS}={SMALL_LOOP_BYTES}"
@@ -39,7 +39,7 @@ def set_cpu_device_count(devices: int) -> None:
     """Makes the CPU at least `devices` XLA devices, at most 16 per core. No effect once JAX has started.
 
     Each device is a thread. With one device per member, members do not wait for each other, and any number of members
-    is spread evenly. The gain is small; BUILD_NOTES.md, "Throughput", has the measurements.
+    is spread evenly. The gain is small (measurements: experiments/results/throughput.md).
     """
     count = min(max(devices, usable_cores()), DEVICES_PER_CORE * usable_cores())
     with suppress(RuntimeError):  # JAX has started, and keeps its devices

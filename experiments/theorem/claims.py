@@ -20,12 +20,12 @@ from experiments.theorem.learning_curves import (
     tenth,
 )
 
-ROUNDING = 1e-4  # float32 may add this to a ratio, and two programs of the same arithmetic may differ by it
+ROUNDING = 1e-4  # rounding error of a ratio in float32; two programs of the same arithmetic may differ by it
 SUPPORTED, CONTRADICTED, NOT_SHOWN = "supported", "contradicted", "not shown"
 
 
 class Statement(NamedTuple):
-    """A claim of the paper and what the study shows about it."""
+    """A claim of the paper, and the study's verdict on it."""
 
     claim: str
     verdict: str  # supported, contradicted, not shown, or in how many rows it holds
@@ -43,7 +43,7 @@ def verdict_of(intervals: Sequence[tuple[float, float]], sign: int, unit: str = 
     `supported` where it holds in all, `contradicted` where all have the other sign, `not shown` where none has a sign.
 
     Args:
-      unit: of what there is one interval each.
+      unit: the things that have an interval each, in the plural.
     """
     sides = [side_of(*row, sign) for row in intervals]
     for side, verdict in ((1, SUPPORTED), (-1, CONTRADICTED), (0, NOT_SHOWN)):
@@ -71,12 +71,12 @@ def _signs(claim: str, results: Mapping[Names, LearningCurves], wanted: Sequence
 
 
 def overestimation(results: Mapping[Names, LearningCurves]) -> Statement:
-    """Eq. 6."""
+    """Whether Q-learning overestimates (eq. 6)."""
     return _signs("Q-learning overestimates (eq. 6)", results, ["q_learning"], +1)
 
 
 def underestimation(results: Mapping[Names, LearningCurves]) -> Statement:
-    """Eq. 7."""
+    """Whether MaxMin and SQT underestimate (eq. 7)."""
     return _signs("The minimum and SQT underestimate (eq. 7)", results, ["maxmin", "sqt"], -1)
 
 
@@ -123,7 +123,7 @@ def convergence(results: Mapping[Names, LearningCurves]) -> Statement:
 
 
 def penalty(results: Mapping[Names, LearningCurves]) -> Statement:
-    """Eqs. 12 and 14."""
+    """Whether the penalty vanishes (eqs. 12, 14)."""
     return _falls("The penalty vanishes (eqs. 12, 14): the std over tables falls", results, "std", ["sqt"])
 
 
@@ -148,7 +148,7 @@ def identical(results: Mapping[Names, LearningCurves]) -> Statement:
 
 
 def non_expansion(found: Sequence[Expansion], num_tables: int, gamma: float, ddof: int, pairs: int) -> Statement:
-    """Eq. 16, by the largest ratios found.
+    """Whether T is a gamma-contraction (eq. 16), by the largest ratios found.
 
     Args:
       pairs: of tables that were searched.

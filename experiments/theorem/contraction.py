@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.theorem.q_learning import Rule, TabularAlgorithm, Target
+from experiments.theorem.q_learning import Rule, TabularAlgorithm, value_inputs
 from sqt_jax.types import Array
 
 PAIRS = 100_000
@@ -37,7 +37,7 @@ def values_of(rule: Rule) -> Values:
     """v for a batch of Q, compiled once for all coefficients."""
 
     def value(q: Array, coef: Array) -> Array:
-        return rule(Target(jnp.zeros(()), jnp.ones(()), q, jnp.zeros((), jnp.int32), coef, 1.0))
+        return rule(value_inputs(q, jnp.zeros((), jnp.int32), coef))
 
     return jax.jit(jax.vmap(value, in_axes=(0, None)))
 

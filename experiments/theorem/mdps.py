@@ -70,11 +70,11 @@ def grid_world(seed: int = 0, size: int = 4, slip: float = 0.2, step: float = -0
         for action in range(4):
             for direction, (down, right) in enumerate(moves):
                 chance = slip / 4 + (1 - slip) * (direction == action)
-                there = min(max(row + down, 0), size - 1) * size + min(max(column + right, 0), size - 1)
-                if there == goal:
+                next_state = min(max(row + down, 0), size - 1) * size + min(max(column + right, 0), size - 1)
+                if next_state == goal:
                     reward[state, action] += chance * (1 - step)
                 else:
-                    transition[state, action, there] += chance
+                    transition[state, action, next_state] += chance
     return Mdp(transition, reward, spread, np.eye(states)[0])
 
 

@@ -54,6 +54,11 @@ class Target(NamedTuple):
     gamma: float
 
 
+def value_inputs(next_q: Array, learner: Array, coef: Array) -> Target:
+    """The inputs for which a rule returns the value that it gives to next_q [N, A]: reward 0, gamma 1."""
+    return Target(reward=jnp.zeros(()), discount=jnp.ones(()), next_q=next_q, learner=learner, coef=coef, gamma=1.0)
+
+
 Rule = Callable[[Target], Array]
 
 
@@ -152,13 +157,15 @@ def model_of(mdp: Mdp, optimal: np.ndarray) -> Model:
 
 
 class Learner(NamedTuple):
+    """An algorithm's tables, and its place in the MDP."""
+
     tables: Array  # [N, S, A]
     visits: Array  # [N, S, A], float32
-    state: Array  # [], where the episode is
+    state: Array  # [], the current state of the episode
     steps: Array  # []
 
 
-class Transition(NamedTuple):
+class TabularTransition(NamedTuple):
     """One step in the MDP; all []."""
 
     state: Array
@@ -170,7 +177,7 @@ class Transition(NamedTuple):
 
 def learn(
     learner: Learner,
-    seen: Transition,
+    seen: TabularTransition,
     chosen: Array,
     coef: Array,
     *,
@@ -179,7 +186,16 @@ def learn(
     power: float,
 ) -> Learner:
     """One update. `chosen []` is the table that learns, for algorithms in which not all do."""
-    target = algorithm.rule(Target(seen.reward, seen.discount, learner.tables[:, seen.next_state], chosen, coef, gamma))
+    target = algorithm.rule(
+        Target(
+            reward=seen.reward,
+            discount=seen.discount,
+            next_q=learner.tables[:, seen.next_state],
+            learner=chosen,
+            coef=coef,
+            gamma=gamma,
+        )
+    )
     learns = jnp.ones(algorithm.num_tables) if algorithm.all_learn else jnp.arange(algorithm.num_tables) == chosen
     learns = learns.astype(jnp.float32)
     at = (slice(None), seen.state, seen.action)
@@ -191,23 +207,30 @@ def learn(
     )
 
 
-def act(model: Model, learner: Learner, key: Array, epsilon: float) -> tuple[Transition, Array]:
+def act(model: Model, learner: Learner, key: Array, epsilon: float) -> tuple[TabularTransition, Array]:
     """One step in the MDP: the transition, and the state of the next step, which is a start state after an end."""
     uniform_key, normal_key = jax.random.split(key)
     explore, action, where, restart = jax.random.uniform(uniform_key, (4,))
     noise = jax.random.normal(normal_key)
     num_states, num_actions = model.reward.shape
-    anything = jnp.minimum((action * num_actions).astype(jnp.int32), num_actions - 1)
+    chosen = jnp.minimum((action * num_actions).astype(jnp.int32), num_actions - 1)
     if epsilon < 1:
         best = jnp.argmax(jnp.mean(learner.tables[:, learner.state], axis=0)).astype(jnp.int32)
-        anything = jnp.where(explore < epsilon, anything, best)
-    at = (learner.state, anything)
-    there = jnp.sum(where >= model.cumulative[at])
-    ended = there == num_states
+        chosen = jnp.where(explore < epsilon, chosen, best)
+    at = (learner.state, chosen)
+    next_state = jnp.sum(where >= model.cumulative[at])
+    ended = next_state == num_states
     reward = model.reward[at] + model.noise[at] * noise
-    there = jnp.minimum(there, num_states - 1)
-    begin = jnp.where(ended, jnp.sum(restart >= model.start), there)
-    return Transition(*at, reward, there, 1.0 - ended.astype(jnp.float32)), begin
+    next_state = jnp.minimum(next_state, num_states - 1)
+    begin = jnp.where(ended, jnp.sum(restart >= model.start), next_state)
+    transition = TabularTransition(
+        state=learner.state,
+        action=chosen,
+        reward=reward,
+        next_state=next_state,
+        discount=1.0 - ended.astype(jnp.float32),
+    )
+    return transition, begin
 
 
 class Measurements(NamedTuple):
@@ -224,7 +247,7 @@ def expected_target(model: Model, tables: Array, coef: Array, algorithm: Tabular
     """The algorithm's operator T on its tables, [N, S, A] -> [L, S, A], for each of L tables that may be learning."""
 
     def value(next_q: Array, learner: Array) -> Array:
-        return algorithm.rule(Target(jnp.zeros(()), jnp.ones(()), next_q, learner, coef, 1.0))
+        return algorithm.rule(value_inputs(next_q, learner, coef))
 
     learners = jnp.arange(algorithm.num_tables if algorithm.num_tables == 2 else 1)
     values = jax.vmap(lambda learner: jax.vmap(value, in_axes=(1, None))(tables, learner))(learners)
@@ -273,7 +296,7 @@ def train(
     stream, choices, tables_key, begin_key = jax.random.split(key, 4)
     begin = jnp.sum(jax.random.uniform(begin_key) >= model.start)
     tables = init_std * jax.random.normal(tables_key, shape)
-    first = Learner(tables, jnp.zeros(shape), begin, jnp.zeros((), jnp.int32))
+    first = Learner(tables=tables, visits=jnp.zeros(shape), state=begin, steps=jnp.zeros((), jnp.int32))
 
     def step(_: Array, learner: Learner) -> Learner:
         seen, begin = act(model, learner, jax.random.fold_in(stream, learner.steps), epsilon)

@@ -26,8 +26,8 @@ Results = dict[Names, LearningCurves]
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What is run; the defaults are in `study_flags`."""
+class StudySettings:
+    """The flags of the study, parsed; their defaults are in `study_flags`."""
 
     mdps: tuple[str, ...]
     algos: tuple[str, ...]
@@ -44,10 +44,11 @@ class Settings:
     weighted_c: float
 
     def algorithms(self) -> dict[str, q_learning.TabularAlgorithm]:
+        """The algorithms by name, with these settings."""
         return q_learning.algorithms(self.tables, self.ddof, self.greedy, self.weighted_c)
 
 
-def run(settings: Settings, out: Path, command: str) -> None:
+def run(settings: StudySettings, out: Path, command: str) -> None:
     """Runs the study, prints the results and writes `TABLE` and `FIGURE` into `out`.
 
     Args:
@@ -88,8 +89,8 @@ def models(name: str, seeds: int, gamma: float) -> q_learning.Model:
     return q_learning.model_of(mdps.stack(found), np.stack([mdps.optimal_q(mdp, gamma) for mdp in found]))
 
 
-def learn(settings: Settings) -> Iterator[tuple[Names, LearningCurves, float]]:
-    """Runs each algorithm on each MDP; gives the names, the curves, and the share of the work that is done."""
+def learn(settings: StudySettings) -> Iterator[tuple[Names, LearningCurves, float]]:
+    """Runs each algorithm on each MDP; yields the names, the curves, and the share of the work done so far."""
     table = settings.algorithms()
     steps = measuring_steps(settings.steps)
     lengths = jnp.asarray(np.diff(steps, prepend=0), jnp.int32)
@@ -121,7 +122,9 @@ def learn(settings: Settings) -> Iterator[tuple[Names, LearningCurves, float]]:
             yield (mdp, algo), curves, done / total
 
 
-def statements(settings: Settings, results: Results, expansions: list[contraction.Expansion]) -> list[claims.Statement]:
+def statements(
+    settings: StudySettings, results: Results, expansions: list[contraction.Expansion]
+) -> list[claims.Statement]:
     """All statements about the paper's claims."""
     return [
         claims.overestimation(results),
@@ -135,7 +138,7 @@ def statements(settings: Settings, results: Results, expansions: list[contractio
     ]
 
 
-def describe(settings: Settings) -> list[str]:
+def describe(settings: StudySettings) -> list[str]:
     """The settings as lines of the table's file."""
     epsilon = settings.epsilon
     return [
@@ -151,7 +154,7 @@ def describe(settings: Settings) -> list[str]:
     ]
 
 
-def _learn_all(settings: Settings, console: Console) -> Results:
+def _learn_all(settings: StudySettings, console: Console) -> Results:
     """`learn` with progress: a status line on a terminal, else a line per algorithm and MDP."""
     began = time.monotonic()
     results: Results = {}

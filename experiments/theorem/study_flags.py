@@ -45,7 +45,7 @@ def define_flags() -> absl_flags.FlagValues:
     return values
 
 
-def parse(argv: Sequence[str]) -> tuple[study.Settings, Path]:
+def parse(argv: Sequence[str]) -> tuple[study.StudySettings, Path]:
     """The settings and the folder of the results, from the command line `argv`, program name first.
 
     Raises:
@@ -84,19 +84,19 @@ def parse(argv: Sequence[str]) -> tuple[study.Settings, Path]:
     flag["coefs"] = coefs
     for name in ("gamma", "lr_power", "epsilon", "init_std", "weighted_c"):
         if not math.isfinite(flag[name]):
-            raise UsageError(f"--{name}: expects a number, got {flag[name]}")
+            raise UsageError(f"--{name}: expects a number, not {flag[name]}")
     if not 0 < flag["gamma"] < 1:  # the ratios of eq. 16 are divided by it
-        raise UsageError(f"--gamma: expects a number above 0 and below 1, got {flag['gamma']:g}")
+        raise UsageError(f"--gamma: expects a number above 0 and below 1, not {flag['gamma']:g}")
     if flag["lr_power"] <= 0.5:
-        raise UsageError(f"--lr_power: expects a number above 0.5 and up to 1, got {flag['lr_power']:g}")
+        raise UsageError(f"--lr_power: expects a number above 0.5 and up to 1, not {flag['lr_power']:g}")
     if flag["weighted_c"] == 0:
-        raise UsageError("--weighted_c: expects a number above 0, got 0")
+        raise UsageError("--weighted_c: expects a number above 0, not 0")
     out = flag.pop("out")
     _check_out(out, flag.pop("overwrite"))
-    settings = {name: flag[name] for name in (field.name for field in dataclasses.fields(study.Settings))}
+    settings = {name: flag[name] for name in (field.name for field in dataclasses.fields(study.StudySettings))}
     for name in ("mdps", "algos", "coefs"):
         settings[name] = tuple(settings[name])
-    return study.Settings(**settings), Path(out)
+    return study.StudySettings(**settings), Path(out)
 
 
 def _check_list(name: str, words: Sequence) -> None:
@@ -113,7 +113,7 @@ def _coefficient(word: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 <= value < math.inf:
-        raise UsageError(f"--coefs: expects numbers of at least 0 like 0,0.5, got {word!r}")
+        raise UsageError(f"--coefs: expects numbers of at least 0 like 0,0.5, not {word!r}")
     return value
 
 

@@ -39,7 +39,7 @@ Advance = Callable[[State, Array], tuple[State, Array, Array, Array]]
 Place = Callable[[Array, Array], tuple[State, Array]]
 
 
-class Episode(NamedTuple):
+class EpisodeState(NamedTuple):
     """The state of an environment inside a `TimeStep`."""
 
     task: State  # the state of `start` and `advance` (for the Gymnasium tasks: a `PhysicsState`)
@@ -76,7 +76,7 @@ def make_environment(
     an episode whose numbers are no longer finite. After each end it calls `start` again (the auto-reset): the time step
     then has the state and `obs` of the new episode, and the old one's last observation as `final_obs`.
 
-    What they must not do: have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
+    They must not have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
     key in the state and split it), branch in Python on a traced value, count the time limit, or start a new episode
     themselves. The state is any tree of arrays; it must have the same structure, shapes and dtypes from both functions.
 
@@ -95,15 +95,21 @@ def make_environment(
       speed: `state -> []`, the forward speed in m/s of the step that led to the state, shown in evaluations.
 
     Returns:
-      The environment; what it promises is at the top of this module. It can be used in `sqt_jax.make_train(config,
+      The environment, with the contract at the top of this module. It can be used in `sqt_jax.make_train(config,
       env=env)`.
     """
 
     def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
-        no = jnp.zeros((), bool)
+        false = jnp.zeros((), bool)
         obs = jnp.asarray(obs, jnp.float32)
-        episode = Episode(task, jnp.zeros((), jnp.int32), key, unstable)
-        return TimeStep(episode, obs, jnp.zeros((), jnp.float32), no, no, obs)
+        return TimeStep(
+            state=EpisodeState(task=task, steps=jnp.zeros((), jnp.int32), key=key, unstable=unstable),
+            obs=obs,
+            reward=jnp.zeros((), jnp.float32),
+            terminated=false,
+            truncated=false,
+            final_obs=obs,
+        )
 
     no_steps = np.zeros((), np.int32)
 
@@ -114,13 +120,13 @@ def make_environment(
     def reset(key: Array) -> TimeStep:
         return new_episode(key, jnp.asarray(no_steps))
 
-    def restart(old: tuple[Episode, Array], _: Any) -> tuple[State, Array]:
+    def restart(old: tuple[EpisodeState, Array], _: Any) -> tuple[State, Array]:
         episode, _ = old
         first = new_episode(episode.key, episode.unstable)
         return first.state, first.obs
 
     def step(timestep: TimeStep, action: Array) -> TimeStep:
-        episode: Episode = timestep.state
+        episode: EpisodeState = timestep.state
         task, obs, reward, terminated = advance(episode.task, jnp.clip(action, -1, 1))
         obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(reward, jnp.float32)
         finite = (jnp.abs(reward) < LARGEST) & jnp.all(jnp.abs(obs) < LARGEST)  # false for NaN too
@@ -132,8 +138,16 @@ def make_environment(
         truncated = steps >= episode_length
 
         ended = terminated | truncated
-        state, obs = cond_if_any(ended, restart, (Episode(task, steps, episode.key, unstable), final_obs))
-        return TimeStep(state, obs, reward, terminated, truncated, final_obs)
+        state = EpisodeState(task=task, steps=steps, key=episode.key, unstable=unstable)
+        state, obs = cond_if_any(ended, restart, (state, final_obs))
+        return TimeStep(
+            state=state,
+            obs=obs,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            final_obs=final_obs,
+        )
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:
         assert place is not None

@@ -25,7 +25,7 @@ class Task(NamedTuple):
     noise: float  # scale of the random start
     normal_velocity: bool = False  # start velocities: normal, or uniform like the positions
     tracked: Callable[[Any, Any], Any] | None = None  # as in `Setup`: the point whose speed along x is rewarded
-    hidden: int = 1  # leading entries of qpos left out of the observation (x, or x and y)
+    unobserved: int = 1  # leading entries of qpos left out of the observation (x, or x and y)
     max_speed: float = INF  # observed velocities are clipped to it
     quantities: tuple[str, ...] = ()  # further fields that are observed, in this order
     # As in v4: the quantities' (constant) entries of the world body and the root's actuator forces are observed too.
@@ -43,7 +43,7 @@ class Task(NamedTuple):
 
 
 def _solver(iterations: int, ls_iterations: int = 3) -> Mapping[str, Mapping[str, int]]:
-    """Options of MJX's solver: the fewest steps that lose no accuracy against MuJoCo (measured: BUILD_NOTES.md)."""
+    """Options of MJX's solver: the fewest steps without a loss of accuracy (experiments/results/physics.md)."""
     return {"mjx": {"iterations": iterations, "ls_iterations": ls_iterations}}
 
 
@@ -87,11 +87,11 @@ V4 = {
     ),
     "ant": Task(
         "Ant-v4", "ant.xml", 5, ctrl_cost=0.5, noise=0.1, normal_velocity=True,
-        tracked=_torso, hidden=2, alive=1.0, healthy=_ant_healthy, options=_solver(7),
+        tracked=_torso, unobserved=2, alive=1.0, healthy=_ant_healthy, options=_solver(7),
     ),
     "humanoid": Task(
         "Humanoid-v4", "humanoid.xml", 5, ctrl_cost=0.1, noise=1e-2,
-        tracked=_center_of_mass, hidden=2, quantities=QUANTITIES,
+        tracked=_center_of_mass, unobserved=2, quantities=QUANTITIES,
         forward=1.25, alive=5.0, healthy=_humanoid_healthy, options=_solver(6),
     ),
     "hopper": Task(
@@ -99,12 +99,12 @@ V4 = {
         max_speed=10.0, alive=1.0, healthy=_hopper_healthy, options=_solver(5),
     ),
     "swimmer": Task(
-        "Swimmer-v4", "swimmer.xml", 4, ctrl_cost=1e-4, noise=0.1, hidden=2, options=_solver(4),
+        "Swimmer-v4", "swimmer.xml", 4, ctrl_cost=1e-4, noise=0.1, unobserved=2, options=_solver(4),
     ),
     # The height is divided by the physics' time step of 0.003 s.
     "humanoid_standup": Task(
         "HumanoidStandup-v4", "humanoidstandup.xml", 5, ctrl_cost=0.1, noise=1e-2,
-        hidden=2, quantities=QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
+        unobserved=2, quantities=QUANTITIES, forward=0.0, height=1 / 0.003, alive=1.0,
         contact_cost=5e-7, max_contact_cost=10.0,
         options=_solver(7),
     ),

@@ -34,7 +34,7 @@ def forces(task: Task, state: PhysicsState) -> Array:
 def observe(task: Task, state: PhysicsState) -> Array:
     """The observation of a physical state: [O]"""
     velocity = jnp.clip(state.qvel, -task.max_speed, task.max_speed)
-    parts = [state.qpos[task.hidden :], velocity]
+    parts = [state.qpos[task.unobserved :], velocity]
     for name in task.quantities:
         quantity = forces(task, state) if name == "cfrc_ext" else state.quantities[name]
         parts.append(quantity if task.observes_world else quantity[WORLD_ENTRIES[name] :])

@@ -30,10 +30,12 @@ class Encoder(nn.Module):
         self.both = nn.ModuleList([first, nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)])
 
     def zs(self, obs: torch.Tensor) -> torch.Tensor:
+        """obs [B, O] -> zs."""
         x = functional.elu(self.state[0](obs))
         return avg_l1_norm(self.state[2](functional.elu(self.state[1](x))))
 
     def zsa(self, zs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """zs, action [B, A] -> zsa."""
         x = functional.elu(self.both[0](torch.cat([zs, action], 1)))
         return self.both[2](functional.elu(self.both[1](x)))
 

@@ -30,7 +30,7 @@ class PhysicsState(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What a task needs of its physics."""
+    """The requirements of a task on its physics."""
 
     model: Any  # a mujoco.MjModel
     frame_skip: int  # physics steps in one control step
@@ -43,7 +43,7 @@ class Setup(NamedTuple):
 class Physics(NamedTuple):
     """The physics of one model, as pure functions of one robot; `vmap` gives many."""
 
-    place: Callable[[Array, Array], PhysicsState]  # (qpos [nq], qvel [nv]) -> state there, without forces
+    place: Callable[[Array, Array], PhysicsState]  # (qpos [nq], qvel [nv]) -> that state, without forces
     advance: Callable[[PhysicsState, Array], PhysicsState]  # (state, control [nu]) -> state one control step later
 
 

@@ -31,7 +31,7 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
     """MJX with Newton's method (the humanoid's file specifies PGS, which MJX does not have).
 
     Args:
-      setup: the model and what the task needs.
+      setup: the model, and the quantities that the task needs.
       iterations: maximum steps of the constraint solver; None: the model file's. A control step with 8 is as close to
         MuJoCo's as one with 100; some tasks need fewer (`Task.options`).
       ls_iterations: maximum steps of its line search; None: the model file's. Under `vmap` all of them are computed.
@@ -58,7 +58,7 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
         return {name: getattr(data._impl if name in PRIVATE else data, name).reshape(-1) for name in names}
 
     def forward(state: PhysicsState, qpos: Array, qvel: Array, control: Array) -> tuple[mjx.Data, PhysicsState]:
-        """Evaluate the dynamics at (qpos, qvel); the returned state has not moved, but has the quantities there."""
+        """Evaluate the dynamics at (qpos, qvel); the returned state has its quantities, but has not moved."""
         _, warm_start = state.internal
         data = _forward(model, data_at(qpos, qvel).replace(ctrl=control, qacc_warmstart=warm_start))
         if "cfrc_ext" in setup.quantities:

@@ -1,7 +1,7 @@
 """Physics `warp`: MuJoCo Warp through MJX, as CUDA kernels called from the compiled program.
 
 All robots of a program (members, environments) are simulated in one call, as one batch of worlds. Warp keeps the
-contacts of all of them in one array, sized for every pair of bodies that can touch, of every robot.
+contacts of all of them in one array, which has room for every pair of bodies that can touch.
 
 Needs the package warp-lang (the extra `warp`). Warp also runs on a CPU, slowly, which is good for tests.
 """
@@ -24,7 +24,7 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
     """MJX-Warp with Newton's method; starts are placed by MJX's kinematics.
 
     Args:
-      setup: the model and what the task needs.
+      setup: the model, and the quantities that the task needs.
       iterations: maximum steps of the constraint solver, which stops when it converges; None: the model file's.
       ls_iterations: maximum steps of its line search; None: the model file's.
 

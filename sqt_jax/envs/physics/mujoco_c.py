@@ -33,7 +33,7 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
     """MuJoCo's C library.
 
     Args:
-      setup: the model and what the task needs.
+      setup: the model, and the quantities that the task needs.
       num_threads: threads that step the robots of a call; None: one for each usable core.
 
     Raises:
@@ -135,7 +135,7 @@ class Stepper:
           [R, F] float32: qpos, qvel, displacement of the tracked point, quantities; NaN for a robot that diverged.
         """
         if mujoco.get_mju_user_warning() is None:
-            mujoco.set_mju_user_warning(_be_quiet)
+            mujoco.set_mju_user_warning(_ignore_warning)
         measured = np.empty((len(rows), self.num_measured), np.float32)
         displacement, first_quantity = self.splits[1], self.splits[1] + 1
         numbers = itertools.count()  # the next row to be stepped; `next` is atomic
@@ -182,10 +182,11 @@ class Stepper:
         return measured
 
     def tracked(self, data: mujoco.MjData) -> float:
+        """x of the tracked point, m."""
         return data.qpos[0] if self.setup.tracked is None else self.setup.tracked(self.model, data)
 
 
-def _be_quiet(message: str) -> None:
+def _ignore_warning(message: str) -> None:
     del message
 
 

@@ -1,4 +1,4 @@
-"""The threads on which `mujoco_c` steps robots on the host, and the number of cores there are for them."""
+"""The threads on which `mujoco_c` steps robots on the host, and the number of cores that the process may use."""
 
 import os
 import queue

@@ -1,6 +1,6 @@
 "use strict";
 
-// A click on a header sorts by its column: ascending, descending, then as the table was.
+// A click on a header sorts by its column: ascending, descending, then in the original order.
 const NEXT = { none: "ascending", ascending: "descending", descending: "none" };
 const WORDS = new Intl.Collator("en", { numeric: true });
 
@@ -18,7 +18,7 @@ function sorted(rows, column, direction) {
   const numbers = filled.every(({ key }) => typeof key === "number");
   const sign = direction === "ascending" ? 1 : -1;
   filled.sort((a, b) => sign * (numbers ? a.key - b.key : WORDS.compare(a.key, b.key)));
-  return [...filled, ...empty].map(({ row }) => row); // what is empty stays below
+  return [...filled, ...empty].map(({ row }) => row); // empty cells stay last
 }
 
 function makeSortable(table) {
@@ -60,7 +60,7 @@ function makeCopyable(block) {
   button.type = "button";
   button.textContent = "Copy";
   button.addEventListener("click", async () => {
-    selectAll(block); // where the clipboard is not to be had, it can be copied by hand
+    selectAll(block); // without a clipboard, the text can be copied by hand
     try {
       await navigator.clipboard.writeText(block.textContent);
       button.textContent = "Copied";
