@@ -10,7 +10,7 @@ from sqt_jax import q_targets
 from sqt_jax.settings import ConfigError, Setting, setting, settings_of
 from sqt_jax.types import Scalars
 
-# What an algorithm may have (its row in `algorithms.ALGORITHMS` says so), and settings may need to have an effect.
+# Properties that an algorithm may have (its row names them) and that settings may require.
 FEATURES = {
     "penalty": "a penalty (_sqt, _sqt_tuple)",
     "subset": "a random subset of the critics (redq, --reduce=subset_min)",
@@ -24,11 +24,11 @@ FEATURES = {
 
 @dataclasses.dataclass(frozen=True)
 class AgentConfig:
-    """What an agent consists of: sizes and choices (static), and the values of the traced `Scalars`."""
+    """The settings of an agent: sizes and choices (static), and the values of the traced `Scalars`."""
 
     # The target (paper eqs. 4, 8, 18-20).
     penalty: str = setting(
-        "none", "what is subtracted from the bootstrapped value", choices=tuple(q_targets.PENALTIES), flag=None
+        "none", "the term subtracted from the bootstrapped value", choices=tuple(q_targets.PENALTIES), flag=None
     )
     penalty_coef: float = setting(
         0.0, "weight of the penalty, the paper's alpha", low=0, swept=True, features=("penalty",)
@@ -50,7 +50,7 @@ class AgentConfig:
     )
     policy_delay: int = setting(1, "critic updates per actor update", low=1)
     actor_reduce: str = setting(
-        "mean", "what the actor maximises of the critics", choices=tuple(q_targets.ACTOR_REDUCTIONS)
+        "mean", "the reduction of the critics that the actor maximises", choices=tuple(q_targets.ACTOR_REDUCTIONS)
     )
     # TD3's noise, in units of the action.
     exploration_noise: float = setting(0.1, "std of the noise on actions", low=0, features=("noise",))
@@ -81,7 +81,7 @@ class AgentConfig:
         0.9, "factor on the best minimum return at the switch (reset_weight)",
         low=0, high=1, features=("checkpoints",), formerly="checkpoint_reset_weight",
     )  # fmt: skip
-    # What the authors of SQT released under the names of TD3, SAC and TD7 (`agents.released`).
+    # The released code's variants of TD3, SAC and TD7 (`agents.released`).
     networks: str = setting("mlp", "mlp, or TD7's networks and update without its checkpoints", choices=("mlp", "sale"))
     sampled_actor: bool = setting(
         False, "a Gaussian actor that is updated by its samples; its mode acts", features=("sale", "noise")
@@ -95,6 +95,7 @@ class AgentConfig:
     )
 
     def scalars(self) -> Scalars:
+        """The traced settings."""
         return Scalars(**{name: getattr(self, name) for name in Scalars._fields})
 
 
@@ -123,13 +124,13 @@ class Config:
 
     algo: str
     env: str
-    physics: str = setting("mjx", "what computes the physics: mjx, mujoco or warp; brax:NAME has others")
+    physics: str = setting("mjx", "the physics: mjx, mujoco or warp; brax:NAME has others")
     eval_physics: str = setting("auto", "the same for evaluation; auto: mujoco on a CPU, else the training's")
     agent: AgentConfig = AgentConfig()
     train: TrainConfig = TrainConfig()
 
     def flat(self) -> dict[str, Any]:
-        """All settings by name, without nesting: what config.json holds and `make_config` reads back."""
+        """All settings by name, without nesting: as in config.json and for `make_config`."""
         own = {"algo": self.algo, "env": self.env, "physics": self.physics, "eval_physics": self.eval_physics}
         return own | dataclasses.asdict(self.agent) | dataclasses.asdict(self.train)
 

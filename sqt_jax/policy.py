@@ -18,8 +18,9 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from sqt_jax.algorithms import agent_of, make_config, make_parts
+from sqt_jax.algorithms import make_parts
 from sqt_jax.config import Config
+from sqt_jax.experiment import agent_of, make_config
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Agent, Array, Environment, State
 

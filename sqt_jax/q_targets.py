@@ -1,11 +1,11 @@
-"""The conservative Q-target of SQT ("std Q-target"), usable alone inside any ensemble actor-critic.
+"""The conservative Q-target of SQT ("std Q-target"), usable on its own in any ensemble actor-critic.
 
     bootstrap_value = reduce_i Q_i(s', a') - entropy_term - penalty
     td_target       = reward + gamma * discount * bootstrap_value
     penalty         = coef * mean_b std_i Q_i(s'_b, a'_b)      SQT        (paper eq. 20: one scalar per batch)
                     = coef * std_i Q_i(s', a')                 SQT-tuple  (paper eq. 19: one value per transition)
 
-Penalties and reductions are functions of `next_q [N, B]`, the N *target* critics at (s', a') of the whole batch. A new
+Penalties and reductions are functions of `next_q [N, B]`, the N *target* critics at (s', a') of the complete batch. A new
 one is a function here and its row in `PENALTIES` or `REDUCTIONS`. Bind their settings: `partial(batch_std, coef=0.5)`.
 """
 

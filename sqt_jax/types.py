@@ -127,7 +127,7 @@ class Observe(Protocol):
     def __call__(self, state: State, episode_return: Array, ended: Array, step: Array) -> State:
         """Reports the progress of the agent's episodes; called after each environment step.
 
-        Only TD7 uses it, for its policy checkpoints. Without it TD7 acts with its initial policy for ever.
+        Only TD7 uses it, for its policy checkpoints. Without it TD7 keeps acting with its initial policy.
 
         Args:
           episode_return: [E], undiscounted, of the running episodes up to this step.

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.evidence.finished_runs import MemberCurves
 from experiments.running import run_config
 from experiments.running.records import EVALUATION_COLUMNS
-from sqt_jax.algorithms import agent_of, make_config
+from sqt_jax.experiment import agent_of, make_config
 from sqt_jax.policy import save_policy
 
 # Markup, and characters that no terminal should get.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe_envs
 
-from sqt_jax import algorithms, train
+from sqt_jax import experiment, train
 from sqt_jax.members import Layout
 
 SETTINGS = {"steps": 400, "warmup_steps": 40, "batch_size": 16, "hidden": (16, 16), "eval_episodes": 2, "gamma": 0.9}
@@ -29,8 +29,8 @@ if __name__ == "__main__":
     jax.distributed.initialize(address, 2, int(rank))
     from jax.experimental import multihost_utils
 
-    config = algorithms.make_config("td3_sqt", "cheetah", **SETTINGS)
+    config = experiment.make_config("td3_sqt", "cheetah", **SETTINGS)
     layout = Layout(3, tuple(jax.devices()))
-    sweep = train.make_sweep(algorithms.make_trainer(config, probe_envs.one_step()), layout)
+    sweep = train.make_sweep(experiment.make_trainer(config, probe_envs.one_step()), layout)
     state = train_a_little(sweep, start(sweep, config, 3))
     np.save(file, multihost_utils.process_allgather(sweep.evaluate(state)[0].returns, tiled=True))

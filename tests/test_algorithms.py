@@ -10,19 +10,9 @@ from probe_envs import constant_reward
 from sqt_jax import lap
 from sqt_jax.agents import sac, td3, td7
 from sqt_jax.agents.policy_checkpoints import CheckpointedState
-from sqt_jax.algorithms import (
-    ALGORITHMS,
-    BASELINES,
-    agent_of,
-    default_agent_config,
-    make_agent,
-    make_config,
-    make_parts,
-    make_train,
-    make_trainer,
-    replay_of,
-)
+from sqt_jax.algorithms import ALGORITHMS, BASELINES, default_agent_config, make_agent, make_parts
 from sqt_jax.config import FEATURES, SETTINGS, AgentConfig, TrainConfig
+from sqt_jax.experiment import agent_of, make_config, make_train, make_trainer, replay_of
 from sqt_jax.ring import RingState
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Transition

@@ -7,9 +7,9 @@ import pytest
 
 from experiments.run import main
 from sqt_jax import envs
-from sqt_jax.algorithms import make_config
 from sqt_jax.config import ConfigError
 from sqt_jax.envs.brax_envs import NAMES, PHYSICS, brax_own
+from sqt_jax.experiment import make_config
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Brax's own
 NAME = "brax:inverted_pendulum"  # the smallest: it compiles in seconds

@@ -16,7 +16,8 @@ from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
 from experiments.running.manifests import CannotResume
 from sqt_jax import train
-from sqt_jax.algorithms import ALGORITHMS, replay_of
+from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.experiment import replay_of
 from sqt_jax.members import Layout
 
 SEEDS = (0, 1, 2)

@@ -12,8 +12,8 @@ import pytest
 
 from experiments.run import main
 from experiments.running import records, session
-from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
+from sqt_jax.experiment import make_config
 
 pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 

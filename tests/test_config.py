@@ -7,8 +7,9 @@ import probe_envs
 import pytest
 from algorithm_rows import has_effect
 
-from sqt_jax.algorithms import ALGORITHMS, make_config
+from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.config import FEATURES, SETTINGS, AgentConfig, TrainConfig
+from sqt_jax.experiment import make_config
 from sqt_jax.settings import ConfigError
 from sqt_jax.types import Scalars
 

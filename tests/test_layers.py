@@ -20,6 +20,7 @@ LAYERS = [
     {"sqt_jax.evaluate"},
     {"sqt_jax.train"},
     {"sqt_jax.algorithms"},
+    {"sqt_jax.experiment"},
     {"sqt_jax.policy"},
     {"sqt_jax"},
     {"experiments"},

@@ -7,7 +7,7 @@ def test_a_first_and_a_later_checkpoint_and_the_wait_of_training_are_timed(monke
     monkeypatch.setattr(measure_checkpoints, "FILLED", 40)
     monkeypatch.setattr(measure_checkpoints, "NEW", 10)
     monkeypatch.setattr(
-        measure_checkpoints.algorithms, "make_config", small(measure_checkpoints.algorithms.make_config)
+        measure_checkpoints.experiment, "make_config", small(measure_checkpoints.experiment.make_config)
     )
     rows = list(measure_checkpoints.bench_checkpoint("td3", "hopper", 2, 1))
     assert [row.what for row in rows] == [

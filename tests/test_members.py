@@ -14,7 +14,7 @@ import one_of_two_processes
 import probe_envs
 import pytest
 
-from sqt_jax import algorithms, members, train
+from sqt_jax import experiment, members, train
 from sqt_jax.members import Layout
 
 DEVICES = tuple(jax.local_devices()[:2])
@@ -60,8 +60,8 @@ def trained(sweep, config, count):
 def both(request):
     """Three members on one device and on two."""
     small = {"embedding_size": 16} if request.param == "td7_sqt" else {}
-    config = algorithms.make_config(request.param, "cheetah", **one_of_two_processes.SETTINGS | small)
-    trainer = algorithms.make_trainer(config, probe_envs.one_step())
+    config = experiment.make_config(request.param, "cheetah", **one_of_two_processes.SETTINGS | small)
+    trainer = experiment.make_trainer(config, probe_envs.one_step())
     sweeps = [train.make_sweep(trainer), train.make_sweep(trainer, Layout(3, DEVICES))]
     return sweeps, [trained(sweep, config, 3) for sweep in sweeps]
 
@@ -109,8 +109,8 @@ def test_one_program_for_all_devices_whatever_the_number_of_steps(both):
 @pytest.mark.slow
 def test_members_train_over_two_processes_as_in_one(tmp_path):
     """`jax.distributed`: the same calls in each process, over the devices of both."""
-    config = algorithms.make_config("td3_sqt", "cheetah", **one_of_two_processes.SETTINGS)
-    sweep = train.make_sweep(algorithms.make_trainer(config, probe_envs.one_step()))
+    config = experiment.make_config("td3_sqt", "cheetah", **one_of_two_processes.SETTINGS)
+    sweep = train.make_sweep(experiment.make_trainer(config, probe_envs.one_step()))
     _, state = trained(sweep, config, 3)
     expected = np.asarray(sweep.evaluate(state)[0].returns)
 

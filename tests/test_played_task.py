@@ -5,8 +5,8 @@ import pytest
 
 from experiments.commandline.arguments import UsageError
 from experiments.playing.played_task import make_played_task
-from sqt_jax.algorithms import make_config
 from sqt_jax.envs import physics
+from sqt_jax.experiment import make_config
 
 HOPPER = make_config("td3", "hopper")
 

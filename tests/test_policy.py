@@ -16,14 +16,14 @@ import probe_envs
 import pytest
 
 from experiments.commandline.presets import preset_settings
-from sqt_jax import algorithms, policy
+from sqt_jax import experiment, policy
 from sqt_jax.algorithms import ALGORITHMS
 
 
 def saved(algo, directory, members=2, **settings):
     env = probe_envs.constant_reward()
-    config = algorithms.make_config(algo, "cheetah", hidden=(8, 8), **settings)
-    agent = algorithms.agent_of(config, env)
+    config = experiment.make_config(algo, "cheetah", hidden=(8, 8), **settings)
+    agent = experiment.agent_of(config, env)
     state = jax.vmap(agent.init)(jax.random.split(jax.random.key(1), members))
     policy.save_policy(directory, config, env, state)
     return agent, state
@@ -45,8 +45,8 @@ def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
 def test_one_agents_state_without_an_axis_of_members_is_rejected(tmp_path):
     """Its first axis would be read as members."""
     env = probe_envs.constant_reward()
-    config = algorithms.make_config("td3", "cheetah", hidden=(8, 8))
-    state = algorithms.agent_of(config, env).init(jax.random.key(1))
+    config = experiment.make_config("td3", "cheetah", hidden=(8, 8))
+    state = experiment.agent_of(config, env).init(jax.random.key(1))
     with pytest.raises(ValueError, match="that of td3 with a leading axis of members"):
         policy.save_policy(tmp_path / "policy", config, env, state, members=1)
     assert not (tmp_path / "policy").exists()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sqt_jax.agents import policy_checkpoints
-from sqt_jax.agents.td7 import Policy
+from sqt_jax.agents.td7 import PolicyParams
 from sqt_jax.config import AgentConfig
 
 SWITCH = 4
@@ -18,7 +18,7 @@ def same(a, b):
 
 
 def labelled(label):
-    return Policy(jnp.float32(label), jnp.float32(label))
+    return PolicyParams(jnp.float32(label), jnp.float32(label))
 
 
 def assess(state, learner, gradient_steps, episode_return, ended=True):

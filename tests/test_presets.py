@@ -6,8 +6,9 @@ import pytest
 from probe_envs import constant_reward
 
 from experiments.commandline.presets import PRESETS, PresetRow, preset_settings
-from sqt_jax.algorithms import ALGORITHMS, make_config, make_train
+from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.config import ConfigError
+from sqt_jax.experiment import make_config, make_train
 
 NINE = [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))]
 NOT_RELEASED = [algo for algo in ALGORITHMS if algo not in NINE]

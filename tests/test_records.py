@@ -16,7 +16,7 @@ from experiments.running.records import (
     summarise,
 )
 from experiments.running.run_config import make_members
-from sqt_jax.algorithms import make_config
+from sqt_jax.experiment import make_config
 
 
 def members_of(*, seeds=(3, 5), **swept):

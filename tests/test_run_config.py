@@ -8,7 +8,7 @@ import pytest
 
 from experiments.running import run_config
 from experiments.running.run_config import default_name
-from sqt_jax.algorithms import make_config
+from sqt_jax.experiment import make_config
 
 OUTPUT = {"tensorboard": True, "checkpoint_every": 20, "keep_checkpoints": 2}
 

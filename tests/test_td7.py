@@ -11,9 +11,9 @@ import pytest
 
 from sqt_jax import sale
 from sqt_jax.agents import td3, td7
-from sqt_jax.algorithms import agent_of, make_config, make_trainer
 from sqt_jax.config import AgentConfig
 from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.experiment import agent_of, make_config, make_trainer
 from sqt_jax.train import Sweep, TrainState, make_sweep, new_interval
 from sqt_jax.types import Agent, Transition
 
@@ -85,7 +85,7 @@ def test_everything_starts_as_the_learner():
     state, checkpoints = init(), checkpointed().checkpoints
     assert same(state.target_actor, state.actor) and same(state.target_critic, state.critic)
     assert same(state.fixed_encoder, state.encoder) and same(state.fixed_encoder_target, state.encoder)
-    assert same(checkpoints.snapshot, td7.Policy(state.actor, state.encoder))
+    assert same(checkpoints.snapshot, td7.PolicyParams(state.actor, state.encoder))
     assert same(checkpoints.checkpoint, checkpoints.snapshot)
     assert same(state.value_bounds, td7.ValueBounds(1e8, -1e8, 0.0, 0.0))
     assert same(checkpoints[2:], (-1e8, 1e8, 0, 0, 0))
@@ -247,7 +247,7 @@ def three_policies():
     """A state whose learner, snapshot and checkpoint differ, and so do its three encoders."""
     first, second, third = init(0), init(1), init(2)
     checkpoints = checkpointed().checkpoints._replace(
-        snapshot=td7.Policy(second.actor, second.encoder), checkpoint=td7.Policy(third.actor, third.encoder)
+        snapshot=td7.PolicyParams(second.actor, second.encoder), checkpoint=td7.PolicyParams(third.actor, third.encoder)
     )
     learner = open_bounds(first._replace(encoder=third.encoder, fixed_encoder_target=second.encoder))
     return checkpointed()._replace(learner=learner, checkpoints=checkpoints)
@@ -287,7 +287,7 @@ def test_an_episodes_end_refreshes_the_snapshot_from_actor_and_fixed_encoder(thr
     running = AGENT.observe(before, jnp.array([5.0]), jnp.array([False]), 0)
     assert same(running, before)
     after = AGENT.observe(before, jnp.array([5.0]), jnp.array([True]), 0)
-    assert same(after.checkpoints.snapshot, td7.Policy(before.learner.actor, before.learner.fixed_encoder))
+    assert same(after.checkpoints.snapshot, td7.PolicyParams(before.learner.actor, before.learner.fixed_encoder))
     assert same(after.checkpoints.checkpoint, before.checkpoints.snapshot)
     assert same(after._replace(checkpoints=None), before._replace(checkpoints=None))
 
@@ -408,7 +408,7 @@ def test_evaluation_plays_the_checkpoint(trained):
     worth = np.asarray(act(state.checkpoints.checkpoint))
     returns = np.asarray(trained.sweep.evaluate(trained.final)[0].returns)
     np.testing.assert_allclose(returns, EPISODE * worth[:, None].repeat(2, axis=1), rtol=1e-5, atol=1e-6)
-    learner = td7.Policy(state.learner.actor, state.learner.fixed_encoder)
+    learner = td7.PolicyParams(state.learner.actor, state.learner.fixed_encoder)
     for other in (state.checkpoints.snapshot, learner):
         assert not np.all(np.isclose(act(other), worth, atol=1e-5))
 

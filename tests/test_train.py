@@ -10,7 +10,7 @@ import numpy as np
 import probe_envs
 import pytest
 
-from sqt_jax import algorithms, envs, q_targets, train
+from sqt_jax import envs, experiment, q_targets, train
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.members import every_leaf
 
@@ -29,8 +29,8 @@ PENALISED = [name for name, row in ALGORITHMS.items() if row.settings.get("penal
 @functools.cache
 def make(algo, make_env=probe_envs.one_step, **settings):
     """Configuration, trainer and compiled sweep; the same ones for the same arguments."""
-    config = algorithms.make_config(algo, "cheetah", **TINY | settings)
-    trainer = algorithms.make_trainer(config, make_env())
+    config = experiment.make_config(algo, "cheetah", **TINY | settings)
+    trainer = experiment.make_trainer(config, make_env())
     return config, trainer, train.make_sweep(trainer)
 
 
@@ -111,8 +111,8 @@ def test_diverged_physics_are_counted_and_never_reach_the_replay():
 def test_a_final_observation_is_kept_for_each_episode_and_no_other_step(task, physics):
     """If an episode's next observations were not the same numbers in both places, each would use room."""
     settings = {"hidden": (8, 8), "batch_size": 8, "steps": 1_200, "warmup_steps": 1_100, "physics": physics}
-    config = algorithms.make_config("td3", task, **settings)
-    sweep = train.make_sweep(algorithms.make_trainer(config))
+    config = experiment.make_config("td3", task, **settings)
+    sweep = train.make_sweep(experiment.make_trainer(config))
     state, metrics = advance(sweep, start(config, sweep, (0, 1)), 1_020, False)
     over = state.timestep.terminated | state.timestep.truncated
     np.testing.assert_array_equal(state.replay.ended, metrics["train_episodes"] - over.sum(axis=1))
@@ -256,7 +256,7 @@ def test_the_compiled_text_writes_the_replay_in_place():
 
 def test_make_train_under_vmap_is_the_sweep(td3):
     config, trainer, sweep = td3
-    run = jax.jit(jax.vmap(algorithms.make_train(config, probe_envs.one_step())))
+    run = jax.jit(jax.vmap(experiment.make_train(config, probe_envs.one_step())))
     keys = jax.vmap(jax.random.key)(jnp.arange(3, dtype=jnp.uint32))
     final, history = run(keys)
     assert history.env_steps[0].tolist() == [0, 100, 200, 300, 400]
@@ -276,12 +276,12 @@ def test_make_train_under_vmap_is_the_sweep(td3):
 
 
 def test_evaluation_steps_and_segments():
-    config = algorithms.make_config("td3", "cheetah").train
+    config = experiment.make_config("td3", "cheetah").train
     stops = train.evaluation_steps(config)
     assert len(stops) == 201 and stops[:2] == [0, 5000] and stops[-1] == 1_000_000
     assert train.segments(20_000, 25_000, config) == [(5000, False)]
     assert train.segments(25_000, 30_000, config) == [(5000, True)]
-    odd = algorithms.make_config(
+    odd = experiment.make_config(
         "td3", "cheetah", steps=30_000, warmup_steps=7_000, eval_every=20_000, num_envs=2
     ).train
     assert train.evaluation_steps(odd) == [0, 20_000, 30_000]
@@ -292,7 +292,7 @@ def test_memory_estimate_is_the_size_of_replay_and_agents():
     config, _, sweep = make("td3")
     state = start(config, sweep)
     agent = sum(leaf.nbytes for leaf in numbers(state.agent))
-    estimate = algorithms.memory_estimate(config, 3, probe_envs.one_step())
+    estimate = experiment.memory_estimate(config, 3, probe_envs.one_step())
     held = sum(leaf.nbytes for leaf in numbers(state.replay))
     assert estimate == pytest.approx(held + 2 * agent, rel=0.01)
 
@@ -328,7 +328,7 @@ def test_every_algorithm_finds_the_known_values_and_the_best_action(algo):
     state, _ = advance(sweep, state, 1300, True)
     state, metrics = advance(sweep, state, 200, True)
     obs = jnp.linspace(-0.4, 0.4, 5)[:, None]
-    agent = algorithms.agent_of(config, probe_envs.one_step())
+    agent = experiment.agent_of(config, probe_envs.one_step())
     act = jax.vmap(lambda s: agent.views.policy_action(agent.views.policy(s), obs))
     np.testing.assert_allclose(np.median(act(state.agent), axis=0), obs, atol=0.1)
     assert np.median(metrics["td_error"]) < 0.1  # targets are rewards, which are the true values
@@ -417,7 +417,7 @@ def test_the_bias_is_measured_for_the_policy_whose_values_critics_estimate(algo)
     assert evaluation.returns.shape == (3, config.train.eval_episodes)
     assert np.isfinite(bias["value_bias"]).all()
     obs = jnp.array([[0.0], [1.0], [2.0]])
-    agent = algorithms.agent_of(config, probe_envs.countdown(3))
+    agent = experiment.agent_of(config, probe_envs.countdown(3))
     for member in range(3):
         own = jax.tree.map(lambda x, m=member: x[m] if x.ndim else x, state.agent)
         if algo == "sac":

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from experiments.benchmarks.measurements import Measurement, member_keys
 from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
-from sqt_jax import algorithms, envs, train
+from sqt_jax import envs, experiment, train
 from sqt_jax.members import layout_here
 
 FILLED = 100_000  # rows in the replay
@@ -21,9 +21,9 @@ NEW = 25_000  # rows since the last checkpoint: the default interval
 
 def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterator[Measurement]:
     """A first checkpoint with all rows, a later one with the rows of one interval, and how long it blocks training."""
-    config = algorithms.make_config(algo, task, replay_capacity=FILLED)
-    trainer = algorithms.make_trainer(config)
-    replay = algorithms.replay_of(config, envs.make(task))
+    config = experiment.make_config(algo, task, replay_capacity=FILLED)
+    trainer = experiment.make_trainer(config)
+    replay = experiment.replay_of(config, envs.make(task))
     layout = layout_here(members)
     sweep = train.make_sweep(trainer, layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())

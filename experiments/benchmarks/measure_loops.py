@@ -18,7 +18,7 @@ from experiments.benchmarks.measurements import (
     member_keys,
     with_devices,
 )
-from sqt_jax import algorithms, train
+from sqt_jax import experiment, train
 from sqt_jax.config import Config
 from sqt_jax.members import Layout
 from sqt_jax.types import Array
@@ -52,7 +52,7 @@ def bench_loops(
         for name in physics
         for count in device_counts(devices, members)
     ]
-    needed = len(cases) * algorithms.memory_estimate(loop_config(algo, task, members), members)
+    needed = len(cases) * experiment.memory_estimate(loop_config(algo, task, members), members)
     for group in [[case] for case in cases] if needed > MAX_INTERLEAVED_BYTES else [cases]:
         yield from measure_cases(group, profiled, **timing)
 
@@ -60,14 +60,14 @@ def bench_loops(
 def loop_config(algo: str, task: str, members: int, physics: str | None = None) -> Config:
     """The settings of a measured run: the defaults, with a smaller replay."""
     capacity = min(100_000, max(1_000, REPLAY_ROWS // members))
-    return algorithms.make_config(algo, task, replay_capacity=capacity, physics=physics)
+    return experiment.make_config(algo, task, replay_capacity=capacity, physics=physics)
 
 
 def loop_steps(algo: str, task: str, members: int, physics: str, devices: int = 1) -> Prepared:
     """A loop of lockstep training steps, compiled and warmed up, and the seconds of its compilation."""
     config = loop_config(algo, task, members, physics)
     layout = Layout(members, tuple(jax.local_devices()[:devices]))
-    sweep = train.make_sweep(algorithms.make_trainer(config), layout)
+    sweep = train.make_sweep(experiment.make_trainer(config), layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
     start = time.perf_counter()

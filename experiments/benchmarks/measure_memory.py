@@ -19,7 +19,7 @@ from experiments.benchmarks.measurements import MEGABYTES, Measurement, member_k
 from experiments.running import runtime
 from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
-from sqt_jax import algorithms, envs, train
+from sqt_jax import envs, experiment, train
 from sqt_jax.config import Config
 from sqt_jax.members import layout_here
 
@@ -43,7 +43,7 @@ def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str
     Raises:
       ConfigError: an invalid setting.
     """
-    config = algorithms.make_config(algo, task, physics=physics, steps=max(STEPS, capacity), replay_capacity=capacity)
+    config = experiment.make_config(algo, task, physics=physics, steps=max(STEPS, capacity), replay_capacity=capacity)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         found = pool.submit(_measured, config, members).result()
     case = f"{algo} on {task}, {physics}, capacity {capacity:,}"
@@ -58,8 +58,8 @@ def _measured(config: Config, members: int) -> Memory:
     runtime.prepare()
     runtime.set_cpu_device_count(members)
     started = _peak_bytes()
-    trainer = algorithms.make_trainer(config)
-    replay = algorithms.replay_of(config, envs.make(config.env, config.physics))
+    trainer = experiment.make_trainer(config)
+    replay = experiment.replay_of(config, envs.make(config.env, config.physics))
     layout = layout_here(members)
     sweep = train.make_sweep(trainer, layout)
     state = sweep.init(member_keys(members), jax.tree.map(lambda x: jnp.full(members, x), config.agent.scalars()))
@@ -78,7 +78,7 @@ def _measured(config: Config, members: int) -> Memory:
         started=started,
         peak=_peak_bytes(),
         on_device=on_device.get("peak_bytes_in_use"),
-        estimate=algorithms.memory_estimate(config, members),
+        estimate=experiment.memory_estimate(config, members),
         replay=rows,
     )
 

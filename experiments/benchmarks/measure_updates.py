@@ -19,7 +19,7 @@ from experiments.benchmarks.measurements import (
     member_keys,
     with_devices,
 )
-from sqt_jax import algorithms, envs
+from sqt_jax import envs, experiment
 from sqt_jax.members import Layout
 from sqt_jax.types import Transition
 
@@ -38,7 +38,7 @@ def bench_updates(
 
     Args:
       devices: numbers of devices; None is the number that a run would use.
-      settings: of the algorithm, as in `algorithms.make_config`.
+      settings: of the algorithm, as in `experiment.make_config`.
     """
     cases = [
         Case(
@@ -58,9 +58,9 @@ def updates(algo: str, task: str, members: int, devices: int = 1, **settings: An
     Raises:
       ConfigError: an invalid setting.
     """
-    config = algorithms.make_config(algo, task, **settings)
+    config = experiment.make_config(algo, task, **settings)
     env = envs.make(task)
-    agent = algorithms.agent_of(config, env)
+    agent = experiment.agent_of(config, env)
     size = config.train.batch_size
 
     def random_batch(key):

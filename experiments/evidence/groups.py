@@ -11,7 +11,7 @@ import numpy as np
 from experiments.evidence import statistics
 from experiments.evidence.finished_runs import MemberCurves
 from sqt_jax import envs
-from sqt_jax.algorithms import OWN_PHYSICS
+from sqt_jax.experiment import OWN_PHYSICS
 
 # The settings of the penalty. Only these may differ between an SQT variant and the baseline it is compared with.
 PENALTY = frozenset({"algo", "penalty", "penalty_coef", "penalty_inside_gamma"})

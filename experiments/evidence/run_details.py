@@ -15,7 +15,8 @@ from experiments.evidence.groups import OWN_PHYSICS, Group, setting_text
 from experiments.evidence.pooling import Collected
 from experiments.evidence.run_settings import RunSettings
 from experiments.running import files
-from sqt_jax.algorithms import ALGORITHMS, make_config
+from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.experiment import make_config
 
 MAX_SUMMARY_BYTES = 10_000_000
 STATUSES = ("done", "interrupted", "diverged")

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.flags import MAX_MEMBERS
 from experiments.running import files, run_config
-from sqt_jax.algorithms import ALGORITHMS, make_config
+from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.experiment import make_config
 
 MAX_TEXT = 100  # characters of a setting
 

@@ -68,7 +68,7 @@ def check(run: Path, options: argparse.Namespace) -> None:
     """
     if not run.is_dir():
         raise UsageError(f"{run}: there is no such folder")
-    if _setting(run, "physics") == "own":  # `sqt_jax.algorithms.OWN_PHYSICS`, without importing JAX
+    if _setting(run, "physics") == "own":  # `sqt_jax.experiment.OWN_PHYSICS`, without importing JAX
         raise UsageError(
             f"{run}: expects a run on one of the library's environments; this one's was handed in from Python: there, "
             f"use sqt_jax.load_policy({str(run / 'policy')!r}) and sqt_jax.evaluate_policy(policy, env)"

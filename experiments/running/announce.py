@@ -13,8 +13,8 @@ from experiments.running.loop import Outcome
 from experiments.running.plan import Plan
 from experiments.running.progress import format_seconds
 from sqt_jax import envs
-from sqt_jax.algorithms import agent_of
 from sqt_jax.envs.gym_tasks import EPISODE_LENGTH
+from sqt_jax.experiment import agent_of
 from sqt_jax.train import evaluation_steps
 
 SHORT = 100_000  # env steps: results of shorter runs need an explanation
@@ -43,7 +43,7 @@ class Announcer:
             self._line(f"resuming at {step}")
             if changed := resume.changed_versions(plan.resumed):
                 self._line(f"package versions differ from the run's, results may differ too: {', '.join(changed)}")
-        # Where the policy that the value estimates refer to is another than the deterministic one, both are evaluated.
+        # If the critics estimate another policy than the deterministic one, both are evaluated.
         episodes = train.eval_episodes * (2 if agent_of(plan.config, plan.env).views.sample else 1)
         self._line(
             evaluation_share(train.steps, len(evaluation_steps(train)), episodes, plan.env.episode_length),

@@ -16,8 +16,8 @@ from experiments.commandline.presets import preset_settings
 from experiments.running import records, resume, run_config, runtime
 from experiments.running.run_config import Member, RunConfig
 from sqt_jax import envs
-from sqt_jax.algorithms import OWN_PHYSICS, check_physics, make_config, memory_estimate
 from sqt_jax.config import Config, TrainConfig
+from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Environment

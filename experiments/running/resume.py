@@ -8,8 +8,8 @@ from typing import Any
 from experiments.commandline.arguments import UsageError
 from experiments.running import records, run_config, runtime
 from experiments.running.run_config import Member, RunConfig
-from sqt_jax.algorithms import check_physics
 from sqt_jax.config import check_train
+from sqt_jax.experiment import check_physics
 from sqt_jax.settings import ConfigError
 
 # Settings that may differ when a run is resumed.

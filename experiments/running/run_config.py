@@ -21,8 +21,8 @@ import jax
 from experiments.commandline.flags import MAX_MEMBERS
 from experiments.running import files
 from sqt_jax import envs
-from sqt_jax.algorithms import OWN_PHYSICS, eval_physics_of, make_config
 from sqt_jax.config import Config
+from sqt_jax.experiment import OWN_PHYSICS, eval_physics_of, make_config
 from sqt_jax.settings import ConfigError
 from sqt_jax.types import Environment, Scalars
 

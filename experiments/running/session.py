@@ -29,7 +29,7 @@ from experiments.running.plan import Plan, make_plan, name_taken, not_only_a_run
 from experiments.running.progress import Display
 from experiments.running.run_config import Member
 from experiments.running.signals import stop_on_signal
-from sqt_jax.algorithms import make_trainer, replay_of
+from sqt_jax.experiment import make_trainer, replay_of
 from sqt_jax.policy import save_policy
 from sqt_jax.train import TrainState, make_sweep
 from sqt_jax.types import Array, Environment, Scalars

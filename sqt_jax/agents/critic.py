@@ -1,4 +1,4 @@
-"""What the critics of all agents share: the variant's target, and one update towards it."""
+"""Shared by the critics of all agents: the variant's target, and one update towards it."""
 
 import functools
 from collections.abc import Callable

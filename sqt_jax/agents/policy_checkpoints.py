@@ -23,7 +23,7 @@ class PolicyCheckpoints(NamedTuple):
     """The policy that acts, the best one so far, and the assessment in progress."""
 
     snapshot: Params  # acts and is assessed
-    checkpoint: Params  # the best so far: what evaluation plays
+    checkpoint: Params  # the best so far; evaluation plays it
     best_min_return: Array  # []: the smallest return of the checkpoint's assessment
     min_return: Array  # []: the smallest return of the assessment in progress
     episodes: Array  # []: episodes of the assessment in progress
@@ -97,6 +97,8 @@ def status(state: PolicyCheckpoints) -> Metrics:
 
 
 class CheckpointedState(NamedTuple):
+    """The learner's state and its policy checkpoints."""
+
     learner: State
     checkpoints: PolicyCheckpoints
 
@@ -113,7 +115,7 @@ def around(config: AgentConfig, learner: Parts, explore: Callable[[Array, Array]
     """The learner's agent with policy checkpoints: the snapshot acts, the checkpoint is evaluated and saved.
 
     Args:
-      learner: its `views.policy` is what gets assessed.
+      learner: its `views.policy` is assessed.
       explore: (deterministic action [B, A], key) -> action [B, A], how the snapshot acts.
     """
     agent, views = learner.agent, learner.agent.views

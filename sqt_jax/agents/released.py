@@ -1,4 +1,4 @@
-"""What the authors of SQT released under the names of TD3, SAC and TD7 (`--preset=released`; see BUILD_NOTES.md).
+"""The agents that the authors of SQT released as TD3, SAC and TD7 (`--preset=released`; see BUILD_NOTES.md).
 
 All three train TD7's networks with TD7's update (`td7.build_learner`). Their actors are Gaussian: those of TD3 and TD7
 act by the mode and are updated by samples; SAC's log-probabilities are those before tanh, averaged over the action's
@@ -60,7 +60,7 @@ def sample(output: Gaussian, eps: Array, config: AgentConfig) -> tuple[Array, Ar
 
 
 def gaussian_sac(config: AgentConfig) -> td7.ActionRules:
-    """SAC's rules."""
+    """SAC's rules, with the released log-probability."""
 
     def next_action(output: Gaussian, draws: sac.SACDraws, scalars: Scalars) -> tuple[Array, Array]:
         action, log_prob = sample(output, draws.next_action_eps, config)
@@ -99,6 +99,7 @@ def _td3_rules(config: AgentConfig) -> td7.ActionRules:
 
 
 def build_td3(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
+    """TD7's update with TD3's rules, without policy checkpoints."""
     return _learner(config, observation_size, action_size, _td3_rules(config))
 
 
@@ -108,5 +109,6 @@ def build_sac(config: AgentConfig, observation_size: int, action_size: int) -> P
 
 
 def build_td7(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
+    """TD7, its actor Gaussian if `sampled_actor`."""
     learner = _learner(config, observation_size, action_size, _td3_rules(config))
     return policy_checkpoints.around(config, learner, functools.partial(td3.explore, config=config))

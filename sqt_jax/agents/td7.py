@@ -81,8 +81,8 @@ class ValueBounds(NamedTuple):
         return self._replace(low=self.running_min, high=self.running_max)
 
 
-class Policy(NamedTuple):
-    """What acting needs."""
+class PolicyParams(NamedTuple):
+    """The parameters that acting needs."""
 
     actor: Params
     encoder: Params
@@ -161,10 +161,10 @@ def build_learner(
             diverged=jnp.zeros((), bool),
         )
 
-    def policy(state: TD7State) -> Policy:
-        return Policy(actor=state.actor, encoder=state.fixed_encoder)
+    def policy(state: TD7State) -> PolicyParams:
+        return PolicyParams(actor=state.actor, encoder=state.fixed_encoder)
 
-    def output(policy: Policy, obs: Array) -> Any:
+    def output(policy: PolicyParams, obs: Array) -> Any:
         return actor_net.apply(policy.actor, obs, encoder_net.zs(policy.encoder, obs))
 
     def act(state: TD7State, obs: Array, key: Array, deterministic: bool = False) -> Array:
