@@ -5,7 +5,7 @@
     penalty         = coef * mean_b std_i Q_i(s'_b, a'_b)      SQT        (paper eq. 20: one scalar per batch)
                     = coef * std_i Q_i(s', a')                 SQT-tuple  (paper eq. 19: one value per transition)
 
-Penalties and reductions are functions of `next_q [N, B]`, the N *target* critics at (s', a') of the complete batch. A new
+Penalties and reductions are functions of `next_q [N, B]`, the N *target* critics at (s', a') of the batch. A new
 one is a function here and its row in `PENALTIES` or `REDUCTIONS`. Bind their settings: `partial(batch_std, coef=0.5)`.
 """
 
