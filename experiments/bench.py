@@ -19,7 +19,7 @@ members: about 200 measurements, each roughly 10 to 90 seconds on a CPU with two
 A machine's speed varies. Compare only figures of one command, or of commands that alternate. To compare the
 checkouts in two folders OLD and NEW:
   for i in 1 2 3 4 5; do for at in OLD NEW; do
-    (cd $at && python -m experiments.bench --suites=update --algos=td3 --tasks=cheetah --nopeak --json=/tmp/$at$i.json)
+    (cd $at && python -m experiments.bench --suites=update --algos=td3 --tasks=cheetah --nopeak --json=$at$i.json)
   done; done
 Compare --devices=1 with --devices=auto in separate commands: with auto and many members the CPU is divided into many
 XLA devices, whose threads slow down measurements on one device as well.

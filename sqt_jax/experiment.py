@@ -113,7 +113,11 @@ def replay_of(config: Config, env: Environment) -> Replay:
     """The replay buffer of an experiment, for an environment's sizes."""
     agent, settings = config.agent, config.train
     rows = Ring(
-        settings.capacity, env.observation_size, env.action_size, settings.num_envs, env.min_mean_episode_length
+        capacity=settings.capacity,
+        observation_size=env.observation_size,
+        action_size=env.action_size,
+        num_envs=settings.num_envs,
+        min_mean_episode_length=env.min_mean_episode_length,
     )
     if "checkpoints" not in ALGORITHMS[config.algo].features:
         return replay.uniform(rows, settings.batch_size)

@@ -285,6 +285,8 @@ def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[Tra
 
         start = trainer.init(key, scalars)
         state, (env_steps, evaluations, metrics) = jax.lax.scan(interval, start, jnp.array(counts))
-        return state, History(env_steps, evaluations.returns, evaluations.lengths, metrics)
+        return state, History(
+            env_steps=env_steps, returns=evaluations.returns, lengths=evaluations.lengths, metrics=metrics
+        )
 
     return train

@@ -83,7 +83,14 @@ def compare(
     """
 
     def measurement(name: str, count: int, rate: float = 0.0, devices: int = 1) -> Measurement:
-        return Measurement("compare", f"{algo} on {task}, {name}", count, UNITS[peer], rate, devices=devices)
+        return Measurement(
+            suite="compare",
+            what=f"{algo} on {task}, {name}",
+            members=count,
+            unit=UNITS[peer],
+            rate=rate,
+            devices=devices,
+        )
 
     devices = usable_devices(members)  # of ours, as in a run
     if peer == "sbx":

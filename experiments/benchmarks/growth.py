@@ -51,7 +51,9 @@ def _update(algo: str, task: str, members: int, point: tuple[str, str, int], **s
     varied, _, value = point
     what = f"{algo}, {task} sizes" + (f", {value} critics" if varied == "critics" else "")
     devices = usable_devices(members)
-    measurement = Measurement("growth", what, members, "member updates", devices=devices, point=point)
+    measurement = Measurement(
+        suite="growth", what=what, members=members, unit="member updates", devices=devices, point=point
+    )
     return Case(measurement, functools.partial(updates, algo, task, members, devices, **settings))
 
 

@@ -42,7 +42,11 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
 
     def measured(what: str, seconds: list[float]) -> Measurement:
         return Measurement(
-            "checkpoint", f"{algo}, {task}, {what}", members, "checkpoints", 1 / statistics.median(seconds)
+            suite="checkpoint",
+            what=f"{algo}, {task}, {what}",
+            members=members,
+            unit="checkpoints",
+            rate=1 / statistics.median(seconds),
         )
 
     yield measured(f"all {FILLED:,} rows, {size / 1e6:,.0f} MB", everything)

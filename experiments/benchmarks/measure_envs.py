@@ -17,7 +17,7 @@ from sqt_jax.envs.physics.threads import usable_cores
 
 def bench_env(task: str, members: int, physics: str, **timing: Any) -> Iterator[Measurement | Failure]:
     """Environment steps with random actions, automatic resets included."""
-    measurement = Measurement("env", f"{task}, {physics}", members, "env steps")
+    measurement = Measurement(suite="env", what=f"{task}, {physics}", members=members, unit="env steps")
     return measure_cases([Case(measurement, preparing(env_steps, task, members, physics))], **timing)
 
 
@@ -37,7 +37,7 @@ def bench_physics(
     for limits, options in solver.items():
         steps[f"mjx {limits}"] = preparing(env_steps, task, members, "mjx", **options)
     cases = [
-        Case(Measurement("physics", f"{task}, {what}", members, "env steps"), prepare)
+        Case(Measurement(suite="physics", what=f"{task}, {what}", members=members, unit="env steps"), prepare)
         for what, prepare in steps.items()
     ]
     return measure_cases(cases, **timing)

@@ -46,7 +46,13 @@ def bench_loops(
     """
     cases = [
         Case(
-            Measurement("loop", f"{algo} on {task}, {with_devices(name, count)}", members, "env steps", devices=count),
+            Measurement(
+                suite="loop",
+                what=f"{algo} on {task}, {with_devices(name, count)}",
+                members=members,
+                unit="env steps",
+                devices=count,
+            ),
             functools.partial(loop_steps, algo, task, members, name, count),
         )
         for name in physics

@@ -49,9 +49,17 @@ def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str
     case = f"{algo} on {task}, {physics}, capacity {capacity:,}"
     parts = {"before the first array": found.started, "replay": found.replay, "estimate": found.estimate}
     listed = ", ".join(f"{name} {size / 1e6:,.0f}" for name, size in parts.items())
-    yield Measurement("memory", f"{case}: at most ({listed})", members, MEGABYTES, found.peak / 1e6)
+    yield Measurement(
+        suite="memory", what=f"{case}: at most ({listed})", members=members, unit=MEGABYTES, rate=found.peak / 1e6
+    )
     if found.on_device:
-        yield Measurement("memory", f"{case}: at most on the device", members, MEGABYTES, found.on_device / 1e6)
+        yield Measurement(
+            suite="memory",
+            what=f"{case}: at most on the device",
+            members=members,
+            unit=MEGABYTES,
+            rate=found.on_device / 1e6,
+        )
 
 
 def _measured(config: Config, members: int) -> Memory:

@@ -27,7 +27,8 @@ def replay_case(kind: str, what: str, task: str, capacity: int, members: int) ->
     """The case of one kind of `REPLAYS`, with rows of a task's sizes and `capacity` rows per member."""
     label = f"{kind} {what}, {task} rows, capacity {capacity:,}"
     return Case(
-        Measurement("replay", label, members, f"{what}s"), preparing(replay_steps, kind, what, task, capacity, members)
+        Measurement(suite="replay", what=label, members=members, unit=f"{what}s"),
+        preparing(replay_steps, kind, what, task, capacity, members),
     )
 
 

@@ -43,7 +43,11 @@ def bench_updates(
     cases = [
         Case(
             Measurement(
-                "update", f"{algo}, {task} {with_devices('sizes', count)}", members, "member updates", devices=count
+                suite="update",
+                what=f"{algo}, {task} {with_devices('sizes', count)}",
+                members=members,
+                unit="member updates",
+                devices=count,
             ),
             functools.partial(updates, algo, task, members, count, **settings),
         )

@@ -91,7 +91,14 @@ def _flag(about: Setting) -> Flag:
     choices = f": {', '.join(about.choices)}" if about.choices and about.choices[0] not in about.help else ""
     swept = "; may be swept" if about.swept else ""
     default = about.default_text or default_text(about)
-    return Flag(about.name, parse, expects, f"{about.help}{choices}{swept}", default, metavar)
+    return Flag(
+        name=about.name,
+        parse=parse,
+        expects=expects,
+        help=f"{about.help}{choices}{swept}",
+        default=default,
+        metavar=metavar,
+    )
 
 
 def default_text(about: Setting) -> str:
@@ -145,44 +152,70 @@ def _flags() -> dict[str, list[Flag]]:
     agent = settings_of(AgentConfig).values()
     return {
         "What to run": [
-            Flag("algo", str, "a name", f"algorithm: {', '.join(ALGORITHMS)}", "required"),
             Flag(
-                "env",
-                str,
-                "a name",
-                "environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's v4); "
+                name="algo", parse=str, expects="a name", help=f"algorithm: {', '.join(ALGORITHMS)}", default="required"
+            ),
+            Flag(
+                name="env",
+                parse=str,
+                expects="a name",
+                help="environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's v4); "
                 "NAME-v5 for its v5; brax:ant and others for Brax's own",
-                "required",
+                default="required",
             ),
             *_group(settings_of(Config).values(), None),
             Flag(
-                "seeds",
-                _list_of(_integer),
-                "whole numbers like 0,1,2",
-                "random seeds; each is a member, times the values of swept settings",
-                _text(DEFAULT_SEEDS),
-                "N,N...",
+                name="seeds",
+                parse=_list_of(_integer),
+                expects="whole numbers like 0,1,2",
+                help="random seeds; each is a member, times the values of swept settings",
+                default=_text(DEFAULT_SEEDS),
+                metavar="N,N...",
             ),
-            Flag("preset", str, f"one of {', '.join(PRESETS)}", f"named settings: {', '.join(PRESETS)}", "paper"),
-            Flag("config", str, "a file", "YAML file of flags without the dashes; it overrides the preset", "none"),
+            Flag(
+                name="preset",
+                parse=str,
+                expects=f"one of {', '.join(PRESETS)}",
+                help=f"named settings: {', '.join(PRESETS)}",
+                default="paper",
+            ),
+            Flag(
+                name="config",
+                parse=str,
+                expects="a file",
+                help="YAML file of flags without the dashes; it overrides the preset",
+                default="none",
+            ),
         ],
         "Training": _group(settings_of(TrainConfig).values(), None),
         "Algorithm": _group(agent, None),
         **{f"With {title}": _group(agent, feature) for feature, title in FEATURES.items()},
         "Output": [
-            Flag("out", str, "a folder", "results go to OUT/ENV/ALGO/NAME/", "runs"),
-            Flag("name", str, "a word", "name of the run", "settings that differ from the defaults, and the time"),
+            Flag(name="out", parse=str, expects="a folder", help="results go to OUT/ENV/ALGO/NAME/", default="runs"),
             Flag(
-                "resume",
-                str,
-                "the folder of a run, or nothing: the latest run of the same settings, or the one called --name",
-                "continue a run from its last checkpoint; --steps may be raised",
-                "off",
+                name="name",
+                parse=str,
+                expects="a word",
+                help="name of the run",
+                default="settings that differ from the defaults, and the time",
             ),
-            Flag("overwrite", None, "true or false", "replace a run of the same name", "false"),
+            Flag(
+                name="resume",
+                parse=str,
+                expects="the folder of a run, or nothing: the latest run of the same settings, or the one called --name",
+                help="continue a run from its last checkpoint; --steps may be raised",
+                default="off",
+            ),
+            Flag(
+                name="overwrite",
+                parse=None,
+                expects="true or false",
+                help="replace a run of the same name",
+                default="false",
+            ),
             *_group(settings_of(OutputConfig).values(), None),
-            Flag("quiet", None, "true or false", "print errors only", "false"),
-            Flag("help", None, "true or false", "this text", ""),
+            Flag(name="quiet", parse=None, expects="true or false", help="print errors only", default="false"),
+            Flag(name="help", parse=None, expects="true or false", help="this text", default=""),
         ],
     }
 

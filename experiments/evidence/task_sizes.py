@@ -52,7 +52,15 @@ def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> ResultTable:
     caption = "Read from the environments."
     if any(row["episode_steps"] is None for row in sizes):
         caption += " Without the steps of an episode: read from the runs."
-    return ResultTable("table1", "Table 1: sizes of the tasks", header, [lines], caption, [], records)
+    return ResultTable(
+        name="table1",
+        title="Table 1: sizes of the tasks",
+        header=header,
+        sections=[lines],
+        caption=caption,
+        notes=[],
+        records=records,
+    )
 
 
 def _known(name: str) -> Mapping[str, Any] | None:

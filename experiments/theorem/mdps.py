@@ -34,7 +34,9 @@ def random_mdp(
     generator = np.random.default_rng(seed)
     transition = generator.dirichlet(np.full(states, concentration), (states, actions))
     reward = generator.normal(scale=spread, size=(states, actions))
-    return Mdp(transition, reward, np.full((states, actions), noise), np.full(states, 1 / states))
+    return Mdp(
+        transition=transition, reward=reward, noise=np.full((states, actions), noise), start=np.full(states, 1 / states)
+    )
 
 
 def bias_chain(seed: int = 0, links: int = 3, actions: int = 8, mean: float = -0.1, noise: float = 1.0) -> Mdp:
@@ -51,7 +53,7 @@ def bias_chain(seed: int = 0, links: int = 3, actions: int = 8, mean: float = -0
         transition[state, :, state + 1] = 1.0
     reward, spread = np.full((links + 1, actions), mean), np.full((links + 1, actions), noise)
     reward[0] = spread[0] = 0.0
-    return Mdp(transition, reward, spread, np.eye(links + 1)[0])
+    return Mdp(transition=transition, reward=reward, noise=spread, start=np.eye(links + 1)[0])
 
 
 def grid_world(seed: int = 0, size: int = 4, slip: float = 0.2, step: float = -0.1, noise: float = 1.0) -> Mdp:
@@ -75,7 +77,7 @@ def grid_world(seed: int = 0, size: int = 4, slip: float = 0.2, step: float = -0
                     reward[state, action] += chance * (1 - step)
                 else:
                     transition[state, action, next_state] += chance
-    return Mdp(transition, reward, spread, np.eye(states)[0])
+    return Mdp(transition=transition, reward=reward, noise=spread, start=np.eye(states)[0])
 
 
 MDPS: dict[str, Callable[[int], Mdp]] = {"random": random_mdp, "chain": bias_chain, "grid": grid_world}
