@@ -159,8 +159,8 @@ def _flags() -> dict[str, list[Flag]]:
                 name="env",
                 parse=str,
                 expects="a name",
-                help="environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's v4); "
-                "NAME-v5 for its v5; brax:ant and others for Brax's own",
+                help="environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's "
+                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own",
                 default="required",
             ),
             *_group(settings_of(Config).values(), None),
@@ -202,7 +202,7 @@ def _flags() -> dict[str, list[Flag]]:
             Flag(
                 name="resume",
                 parse=str,
-                expects="the folder of a run, or nothing: the latest run of the same settings, or the one called --name",
+                expects="the folder of a run, or nothing: the latest run of the same settings, or the run --name",
                 help="continue a run from its last checkpoint; --steps may be raised",
                 default="off",
             ),
