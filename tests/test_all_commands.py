@@ -1,4 +1,7 @@
-"""Every algorithm starts on every task with its default settings, through the command line."""
+"""Every algorithm and every task start with default settings, through the command line.
+
+An agent knows a task by its sizes only, so algorithms and tasks are not combined.
+"""
 
 import csv
 
@@ -22,10 +25,9 @@ def starts(algo, env, out, *more):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env", ["cheetah", "walker", "ant", "humanoid"])
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_algorithm_starts_on_the_papers_tasks(algo, env, tmp_path):
-    starts(algo, env, tmp_path)
+def test_every_algorithm_starts(algo, tmp_path):
+    starts(algo, "ant", tmp_path, "--physics=mujoco")
 
 
 @pytest.mark.slow
@@ -38,4 +40,4 @@ def test_every_task_starts_on_all_physics(env, physics, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", [algo for algo in ALGORITHMS if algo.startswith(("td3", "sac", "td7"))])
 def test_the_released_preset_starts(algo, tmp_path):
-    starts(algo, "cheetah", tmp_path, "--preset=released")
+    starts(algo, "cheetah", tmp_path, "--preset=released", "--physics=mujoco")
