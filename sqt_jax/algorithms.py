@@ -21,7 +21,7 @@ class Algorithm(NamedTuple):
     """A row of the table."""
 
     build: Build  # the agent as in its paper
-    build_released: Build  # the same with the settings of `agents.released`
+    build_released: Build  # the authors' released code: used if a setting of `released.SETTINGS` is changed
     features: frozenset[str]  # of `config.FEATURES`; a penalty, a subset and --networks add theirs
     settings: Mapping[str, Any]  # where the row differs from AgentConfig's defaults
     training: Mapping[str, Any] = MappingProxyType({})  # and from TrainConfig's

@@ -26,7 +26,7 @@ FEATURES = {
 class AgentConfig:
     """The settings of an agent: sizes and choices (static), and the values of the traced `Scalars`."""
 
-    # The target (paper eqs. 4, 8, 18-20).
+    # The target (SQT paper, eqs. 4, 8, 18-20).
     penalty: str = setting(
         "none", "the term subtracted from the bootstrapped value", choices=tuple(q_targets.PENALTIES), flag=None
     )

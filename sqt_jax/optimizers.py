@@ -21,7 +21,7 @@ def adam_step(
     diverged = diverged | ~jnp.isfinite(optax.tree.norm(grads, squared=True))
     direction, moments = _adam.update(grads, opt_state)
     moved = optax.apply_updates(params, jax.tree.map(lambda d: -lr * d, direction))
-    return *trees.where(diverged, (params, opt_state), (moved, moments)), diverged
+    return trees.where(diverged, params, moved), trees.where(diverged, opt_state, moments), diverged
 
 
 def soft_update(target: Params, online: Params, tau: Array | float, diverged: Array) -> Params:

@@ -40,7 +40,7 @@ class Setting(NamedTuple):
     choices: tuple[str, ...] = ()
     swept: bool = False  # traced: a list of values is a sweep (`types.Scalars`)
     features: tuple[str, ...] = ()  # it has an effect only with all of these (`config.FEATURES`)
-    flag: str | None = None  # the flag that sets it; None: the algorithm's name does
+    flag: str | None = None  # the flag that sets it; None: there is none (`penalty`: the algorithm's name sets it)
     auto: str | None = None  # the switch that the word `auto` turns on instead
     default_text: str = ""  # what `--help` shows if the default depends on other things
     formerly: str | None = None  # its name in older files

@@ -35,8 +35,8 @@ class Transition(NamedTuple):
 class TimeStep(NamedTuple):
     """The result of an environment's `reset` and `step`.
 
-    When an episode ends (`terminated` or `truncated`), `obs` is already the first observation of the next episode,
-    `final_obs` the last one of the episode that ended. Elsewhere `final_obs` equals `obs`.
+    When an episode ends (`terminated` or `truncated`), `state` and `obs` are already those of the next episode,
+    `final_obs` is the last observation of the episode that ended. Elsewhere `final_obs` equals `obs`.
     """
 
     state: State  # physics, the episode's step counter and the key of the next start

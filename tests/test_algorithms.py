@@ -32,7 +32,7 @@ def base_of(algo):
 
 
 def test_the_table_has_these_names():
-    assert set(ALGORITHMS) == set(NAMES)
+    assert set(ALGORITHMS) >= set(NAMES)
 
 
 @pytest.mark.parametrize("algo", NAMES)

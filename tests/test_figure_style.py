@@ -5,9 +5,17 @@ from figure_reader import legend_of, panels
 from made_runs import write_run
 from matplotlib.colors import to_rgb
 
-from experiments.evidence.figure_style import ALGORITHM_COLOURS, PENALTY_LINES, Stars, add_texts, make_panels, styles
+from experiments.evidence.figure_style import (
+    ALGORITHM_COLOURS,
+    PENALTY_LINES,
+    Stars,
+    add_texts,
+    algorithm_style,
+    make_panels,
+    styles,
+)
 from experiments.evidence.pooling import collect
-from experiments.evidence.variants import baseline_of, variants_of
+from experiments.evidence.variants import baseline_of, variant_with
 from sqt_jax.algorithms import ALGORITHMS
 
 
@@ -24,9 +32,10 @@ def finished(runs):
 
 def test_every_algorithm_has_a_colour_and_a_line_of_its_own():
     assert {*ALGORITHM_COLOURS} == {*ALGORITHMS}
-    assert len({*ALGORITHM_COLOURS.values()}) == len(ALGORITHM_COLOURS)
+    assert len({str(algorithm_style(algo)) for algo in ALGORITHMS}) == len(ALGORITHMS)
     for baseline in ("td3", "sac", "td7"):  # in grey, an SQT variant is lighter than its baseline
-        shades = [luminance(ALGORITHM_COLOURS[algo]) for algo in (baseline, *variants_of(baseline))]
+        of_paper = [variant_with(baseline, penalty) for penalty in PENALTY_LINES]
+        shades = [luminance(ALGORITHM_COLOURS[algo]) for algo in (baseline, *of_paper)]
         assert shades == sorted(shades) and np.diff(shades).min() > 0.08
 
 

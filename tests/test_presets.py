@@ -51,9 +51,16 @@ def test_paper_changes_nothing_and_quick_is_shorter():
     assert preset_settings("quick", "sac_sqt", "ant")["steps"] < 50_000
 
 
-def test_later_rows_override_earlier_ones_if_their_patterns_match(monkeypatch):
-    rows = (PresetRow({"steps": 1, "lr": 0.1}), PresetRow({"steps": 2}, algo="td3*"), PresetRow({"lr": 0.3}, env="ant"))
+def test_later_rows_override_earlier_ones_if_they_are_for_the_algorithm(monkeypatch):
+    rows = (
+        PresetRow({"steps": 1, "lr": 0.1}),
+        PresetRow({"steps": 2}, ("td3", "td7")),
+        PresetRow({"lr": 0.3}, penalty=True),
+    )
     monkeypatch.setitem(PRESETS, "layers", rows)
     assert preset_settings("layers", "sac", "walker") == {"steps": 1, "lr": 0.1}
-    assert preset_settings("layers", "td3_sqt", "walker") == {"steps": 2, "lr": 0.1}
-    assert preset_settings("layers", "td3", "ant") == {"steps": 2, "lr": 0.3}
+    assert preset_settings("layers", "td3_sqt", "walker") == {"steps": 2, "lr": 0.3}
+    assert preset_settings("layers", "td3", "ant") == {"steps": 2, "lr": 0.1}
+    # A row under a name of its own: rows decide, not names.
+    monkeypatch.setitem(ALGORITHMS, "careful", ALGORITHMS["td3_sqt"])
+    assert preset_settings("layers", "careful", "ant") == {"steps": 2, "lr": 0.3}

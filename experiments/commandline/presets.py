@@ -2,18 +2,18 @@
 
 import functools
 import operator
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
+from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.settings import ConfigError
 
 
 class PresetRow(NamedTuple):
-    """Settings for the algorithms and environments whose names match (`*` matches everything)."""
+    """Settings for some algorithms."""
 
     settings: dict[str, Any]
-    algo: str = "*"
-    env: str = "*"
+    baselines: tuple[str, ...] = ()  # for these and their SQT variants; empty: for all algorithms
+    penalty: bool = False  # for those with a penalty only
 
 
 # The authors' released code trains TD7's update with TD3's or SAC's actions, under the names of TD3 and SAC, with an
@@ -39,22 +39,27 @@ PRESETS: dict[str, tuple[PresetRow, ...]] = {
     ),
     # The authors' released code (BUILD_NOTES.md, "What is trained, in full").
     "released": (
-        PresetRow(UNTRAINED_SALE | {"sampled_actor": True}, algo="td3*"),
-        PresetRow(UNTRAINED_SALE | {"policy_delay": 2, "squashed_log_prob": False}, algo="sac*"),
-        PresetRow({"sampled_actor": True, "updates_per_step": 2}, algo="td7*"),
-        PresetRow({"penalty_coef": 1.0}, algo="td?_sqt*"),
-        PresetRow({"penalty_coef": 1.0}, algo="sac_sqt*"),
+        PresetRow(UNTRAINED_SALE | {"sampled_actor": True}, ("td3",)),
+        PresetRow(UNTRAINED_SALE | {"policy_delay": 2, "squashed_log_prob": False}, ("sac",)),
+        PresetRow({"sampled_actor": True, "updates_per_step": 2}, ("td7",)),
+        PresetRow({"penalty_coef": 1.0}, ("td3", "sac", "td7"), penalty=True),
     ),
 }
 
 
 def preset_settings(preset: str, algo: str, env: str) -> dict[str, Any]:
-    """The settings of a preset for one algorithm and environment (by their own names, not aliases).
+    """The settings of a preset for one algorithm; `env` is for the message only.
 
     Raises:
-      ConfigError: the preset says nothing of this algorithm and environment.
+      ConfigError: the preset says nothing of this algorithm.
     """
-    rows = [row for row in PRESETS[preset] if fnmatchcase(algo, row.algo) and fnmatchcase(env, row.env)]
-    if PRESETS[preset] and not rows:
+    row = ALGORITHMS[algo]
+    has_penalty = row.settings.get("penalty", "none") != "none"
+    found = [
+        each.settings
+        for each in PRESETS[preset]
+        if (not each.baselines or (row.baseline or algo) in each.baselines) and (has_penalty or not each.penalty)
+    ]
+    if PRESETS[preset] and not found:
         raise ConfigError("preset", f"{preset} has no settings for {algo} on {env}")
-    return functools.reduce(operator.or_, (row.settings for row in rows), {})
+    return functools.reduce(operator.or_, found, {})

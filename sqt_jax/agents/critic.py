@@ -53,7 +53,7 @@ def update(
     terms: dict[str, Array],
     loss: Callable[[Array, Array], Array] = squared_error,
 ) -> tuple[Any, Array, Metrics]:
-    """One Adam step of all critics towards `td_target`'s target [B], with metrics; `q_std` is SQT's eq. 18.
+    """One Adam step of all critics towards the target [B], with metrics; `q_std` is SQT's eq. 18 (its mean is eq. 17).
 
     If the loss or a gradient is not finite or a value exceeds `LARGEST_VALUE`, the agent has diverged: the critics stay
     as they were and td_error is 0.

@@ -133,7 +133,8 @@ def around(config: AgentConfig, learner: Parts, explore: Callable[[Array, Array]
         state: CheckpointedState, batch: Transition, draws: Any, step: Array
     ) -> tuple[CheckpointedState, Array, Metrics]:
         learned, td_error, metrics = learner.update(state.learner, batch, draws, step)
-        checkpoints = lower_best(config, state.checkpoints, step + 1)
+        # The barrier: XLA would copy networks that an update does not change at each environment step.
+        checkpoints = lower_best(config, jax.lax.optimization_barrier(state.checkpoints), step + 1)
         return CheckpointedState(learner=learned, checkpoints=checkpoints), td_error, metrics
 
     def observe(state: CheckpointedState, episode_return: Array, ended: Array, step: Array) -> CheckpointedState:

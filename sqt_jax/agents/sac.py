@@ -28,7 +28,7 @@ class SACState(NamedTuple):
     critic_opt: optax.OptState
     temperature_opt: optax.OptState
     scalars: Scalars
-    diverged: Array  # [] bool: the agent is frozen (`critic.update`)
+    diverged: Array  # [] bool: the agent no longer learns (`critic.update`)
 
 
 class SACDraws(NamedTuple):
@@ -48,7 +48,7 @@ def draw(key: Array, batch: Transition, config: AgentConfig) -> SACDraws:
 
 
 def temperature_loss(log_temperature: Array, log_prob: Array, target_entropy: float) -> Array:
-    """The dual loss of the temperature (eq. 18): log_prob [B] -> []."""
+    """The dual loss of the temperature (SAC paper, eq. 18): log_prob [B] -> []."""
     return -jnp.exp(log_temperature) * jnp.mean(log_prob + target_entropy)
 
 
@@ -91,7 +91,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return policy_action(state.actor, obs) if deterministic else sample(state, obs, key)[0]
 
     def td_target(state: SACState, batch: Transition, draws: SACDraws) -> tuple[Array, dict[str, Array]]:
-        """The soft value of a sample of the current actor (eqs. 3, 5), minus the penalty (SQT paper, eqs. 19-20)."""
+        """The soft value of the current actor (SAC paper, eqs. 3, 5), minus the penalty (SQT paper, eqs. 19-20)."""
         next_action, next_log_prob = actor_net.apply(state.actor, batch.next_obs).sample(draws.next_action_eps)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         entropy_term = temperature(state) * next_log_prob
@@ -105,7 +105,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return critics.update(config, state, q_values, *td_target(state, batch, draws))
 
     def update_actor(state: SACState, batch: Transition, draws: SACDraws) -> tuple[SACState, Metrics]:
-        """The reparametrised policy loss (eq. 9), and the temperature's step where it is learned."""
+        """The reparametrised policy loss (SAC paper, eq. 9), and the temperature's step where it is learned."""
 
         def loss_fn(actor):
             action, log_prob = actor_net.apply(actor, batch.obs).sample(draws.action_eps)
@@ -146,5 +146,5 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         q_values=lambda state, obs, action: critic_net.apply(state.critic, obs, action),
         sample=sample_with_bonus,
     )
-    draws = functools.partial(draw, config=config)
-    return assemble(init=init, act=act, draw=draws, update=update, td_target=td_target, views=views)
+    draw_update = functools.partial(draw, config=config)
+    return assemble(init=init, act=act, draw=draw_update, update=update, td_target=td_target, views=views)

@@ -25,12 +25,12 @@ class TD3State(NamedTuple):
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     scalars: Scalars
-    diverged: Array  # [] bool: the agent is frozen (`critic.update`)
+    diverged: Array  # [] bool: the agent no longer learns (`critic.update`)
 
 
 class TD3Draws(NamedTuple):
     target_noise: Array  # [B, A], scaled, not yet clipped
-    subset: Array  # [M]: critics of the target
+    subset: Array  # [M]: critics of the target (all, except in REDQ)
 
 
 def explore(action: Array, key: Array, config: AgentConfig) -> Array:
@@ -40,7 +40,7 @@ def explore(action: Array, key: Array, config: AgentConfig) -> Array:
 
 
 def smooth(action: Array, noise: Array, config: AgentConfig) -> Array:
-    """Target policy smoothing (eqs. 14-15): the action [B, A] with clipped noise [B, A], in [-1, 1]."""
+    """Target policy smoothing (TD3 paper, eqs. 14-15): the action [B, A] with clipped noise [B, A], in [-1, 1]."""
     return jnp.clip(action + jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip), -1.0, 1.0)
 
 
@@ -76,7 +76,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return action if deterministic else explore(action, key, config)
 
     def td_target(state: TD3State, batch: Transition, draws: TD3Draws) -> tuple[Array, dict[str, Array]]:
-        """The minimum over the target critics at the smoothed action (eq. 10), minus the penalty (SQT, eqs. 19-20)."""
+        """The minimum over the target critics (TD3 paper, eq. 10), minus the penalty (SQT paper, eqs. 19-20)."""
         next_action = smooth(actor_net.apply(state.target_actor, batch.next_obs), draws.target_noise, config)
         next_q = critic_net.apply(state.target_critic, batch.next_obs, next_action)
         return critics.td_target(config, state, batch, next_q, draws)
@@ -88,7 +88,7 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         return critics.update(config, state, q_values, *td_target(state, batch, draws))
 
     def update_actor(state: TD3State, batch: Transition) -> tuple[TD3State, Array]:
-        def loss_fn(actor):  # the deterministic policy gradient, eq. 2
+        def loss_fn(actor):  # the deterministic policy gradient (TD3 paper, eq. 2)
             q = critic_net.apply(state.critic, batch.obs, actor_net.apply(actor, batch.obs))
             return -jnp.mean(q_targets.ACTOR_REDUCTIONS[config.actor_reduce](q))
 
@@ -117,5 +117,5 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
         policy_action=actor_net.apply,
         q_values=lambda state, obs, action: critic_net.apply(state.critic, obs, action),
     )
-    draws = functools.partial(draw, config=config)
-    return assemble(init=init, act=act, draw=draws, update=update, td_target=td_target, views=views)
+    draw_update = functools.partial(draw, config=config)
+    return assemble(init=init, act=act, draw=draw_update, update=update, td_target=td_target, views=views)

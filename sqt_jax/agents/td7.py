@@ -101,11 +101,11 @@ class TD7State(NamedTuple):
     encoder_opt: optax.OptState
     value_bounds: ValueBounds
     scalars: Scalars
-    diverged: Array  # [] bool: the agent is frozen (`critic.update`)
+    diverged: Array  # [] bool: the agent no longer learns (`critic.update`)
 
 
 def encoder_loss(zsa: Array, next_zs: Array) -> Array:
-    """How far zsa [B, Z] is from the next observation's zs [B, Z], which gets no gradient (eq. 2): -> []."""
+    """How far zsa [B, Z] is from the next observation's zs [B, Z], which gets no gradient (TD7 paper, eq. 2): -> []."""
     return jnp.mean((zsa - jax.lax.stop_gradient(next_zs)) ** 2)
 
 
