@@ -158,8 +158,11 @@ def test_a_variant_starts_exactly_as_its_baseline(algo):
 
 
 OWN_SIZES = [(algo, row.settings.get("ensemble_size", AgentConfig.ensemble_size)) for algo, row in ALGORITHMS.items()]
-SIZES = [*OWN_SIZES, *((algo, 1) for algo in BASES), *((algo, 5) for algo in ONE_OF_EACH)]
-SIZES += [pytest.param(algo, 5, marks=pytest.mark.slow) for algo in KINDS if algo not in ONE_OF_EACH]
+# Fast: one row of each agent and penalty as it is, one of each with 5 critics.
+FAST = [(algo, n) for algo, n in OWN_SIZES if algo in ("td3", "sac", "redq", *ONE_OF_EACH)]
+FAST += [(algo, n) for algo in ("td3", "sac_sqt") for n in (1, 5) if n == 5 or algo in BASES]
+SLOW = [*OWN_SIZES, *((algo, n) for algo in KINDS for n in (1, 5) if n == 5 or algo in BASES)]
+SIZES = [*FAST, *(pytest.param(*each, marks=pytest.mark.slow) for each in dict.fromkeys(SLOW) if each not in FAST)]
 
 
 @pytest.mark.parametrize(("algo", "n"), SIZES)

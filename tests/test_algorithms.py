@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import algorithm_rows
 import jax
 import jax.numpy as jnp
 import pytest
@@ -149,7 +150,7 @@ def test_a_custom_environment_gives_the_sizes(algo):
     assert storage.shape == (300, env.observation_size + env.action_size + 3)
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@algorithm_rows.every(fast=algorithm_rows.ONE_OF_EACH)
 def test_every_row_makes_a_complete_run(algo):
     """Traced, not compiled: every part of the row fits the train loop."""
     env = constant_reward()

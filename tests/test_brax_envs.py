@@ -27,6 +27,7 @@ def test_the_names_are_braxs_except_its_test_environment():
     assert {name.removeprefix("brax:") for name in NAMES} == set(theirs._envs) - {"fast"}
 
 
+@pytest.mark.slow
 def test_steps_are_braxs(pendulum):
     from brax import envs as theirs
 

@@ -13,6 +13,7 @@ def reference(tmp_path_factory):
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_killed_run_ends_like_a_run_without_a_break(tmp_path, reference, number):
     line = kill_and_resume("tiny", "td3_sqt", tmp_path / "run", reference, number)
     assert "killed a" in line and line.endswith("resumed, identical")

@@ -1,8 +1,11 @@
 """The cost of checkpoints."""
 
+import pytest
+
 from experiments.benchmarks import measure_checkpoints
 
 
+@pytest.mark.slow
 def test_a_first_and_a_later_checkpoint_and_the_wait_of_training_are_timed(monkeypatch):
     monkeypatch.setattr(measure_checkpoints, "FILLED", 40)
     monkeypatch.setattr(measure_checkpoints, "NEW", 10)

@@ -9,6 +9,7 @@ from experiments.benchmarks.measure_updates import bench_updates
 SHORT = {"seconds": 0.0, "repeats": 1}
 
 
+@pytest.mark.slow
 def test_an_updates_row_counts_the_updates_of_all_members():
     (row,) = bench_updates("td3_sqt", "cheetah", 2, **SHORT)
     assert (row.suite, row.what, row.members) == ("update", "td3_sqt, cheetah sizes", 2)

@@ -48,7 +48,8 @@ def test_mujoco_and_mjx_are_the_same_version():
     assert version("mujoco") == version("mujoco-mjx")
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("Euler", marks=pytest.mark.slow), "RK4"])
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.slow
 def test_both_integrators_follow_mujoco_in_free_flight(integrator):
     model = model_of(integrator)
     physics = mjx.make(Setup(model, 5, tracked=lambda model, data: data.xpos[1, 0]))
@@ -177,6 +178,7 @@ def test_first_state_is_at_rest_of_forces(name):
     assert np.isfinite(timestep.obs).all()
 
 
+@pytest.mark.slow  # on MuJoCo C it is fast: test_mujoco_c
 @pytest.mark.parametrize("fault", [np.nan, np.inf, 1e11])
 def test_a_diverged_robot_ends_its_episode_and_no_other(fault):
     first = placed("ant")

@@ -36,6 +36,7 @@ def copy_run(name, **changes):
     (path / "config.json").write_text(json.dumps(config))
 
 
+@pytest.mark.slow
 def test_an_environment_of_ones_own_from_start_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     env, path = make_point(), "runs/point/td3_sqt/first"

@@ -8,6 +8,7 @@ from experiments.gymnasium_parity import parity_report
 from experiments.gymnasium_parity.gymnasium_reference import record_episode
 
 
+@pytest.mark.slow
 def test_the_report_has_a_row_for_every_task_and_physics(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(parity.runtime, "prepare", lambda: None)
     monkeypatch.setattr(

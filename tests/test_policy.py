@@ -9,6 +9,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import algorithm_rows
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +33,7 @@ def saved(algo, directory, members=2, **settings):
 RELEASED = {f"{algo} released": preset_settings("released", algo, "cheetah") for algo in ("td3", "sac", "td7")}
 
 
-@pytest.mark.parametrize("algo", [*ALGORITHMS, *RELEASED])
+@algorithm_rows.every([*ALGORITHMS, *RELEASED], fast=("td3", "sac", "td7_sqt", "sac released"))
 def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
     agent, state = saved(algo.split()[0], tmp_path / "policy", **RELEASED.get(algo, {}))
     obs = jnp.linspace(-1, 1, 6).reshape(3, 2)

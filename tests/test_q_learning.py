@@ -115,6 +115,7 @@ def swept():
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ta.algorithms())
 def test_every_algorithm_converges(name):
     record, learner = swept()[name]

@@ -89,7 +89,17 @@ def ids(argv):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("example", PYTHON, ids=name_of)
+@pytest.mark.parametrize(
+    "example",
+    # The library guide's training runs are slow tests; the first page's example of one is not.
+    [
+        pytest.param(e, marks=pytest.mark.slow)
+        if name_of(e).endswith("README.md:make_environment") and "sqt" in e[0] or name_of(e).endswith(":make_config")
+        else e
+        for e in PYTHON
+    ],
+    ids=name_of,
+)
 def test_python_examples_run(example, tmp_path, monkeypatch):
     page, code = example
     monkeypatch.chdir(tmp_path)  # some leave a run
@@ -198,6 +208,7 @@ def test_the_miniatures_commands_are_valid():
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.slow
 def test_a_policy_of_a_run_loads_as_shown(tmp_path):
     """The examples marked `run-folder`, on a tiny run."""
     argv = ["run", "--algo=td3", "--env=cheetah", "--seeds=0", "--steps=60", "--warmup_steps=20", "--batch_size=8"]

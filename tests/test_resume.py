@@ -236,6 +236,7 @@ def test_a_signal_in_the_last_chunk_changes_nothing(tmp_path, monkeypatch, unbro
     assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path))) == []
 
 
+@pytest.mark.slow
 def test_invalid_steps_are_rejected_and_the_run_does_not_change(tmp_path, capsys):
     assert run(tmp_path, *MEMBERS, "--num_envs=2", "--checkpoint_every=20") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

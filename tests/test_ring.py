@@ -202,6 +202,7 @@ def test_members_have_their_own_of_every_field_except_the_number_of_inserted_tra
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=8)
+@pytest.mark.slow
 def test_rows_saved_one_part_after_another_restore_everything(num_envs, shortest, steps, how_often, seed):
     ring, insert, read = compiled(num_envs, shortest)
     generator = np.random.default_rng(seed)

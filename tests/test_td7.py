@@ -421,6 +421,7 @@ def test_the_replay_learns_its_priorities(trained):
     np.testing.assert_allclose(np.sum(levels[-1], axis=(1, 2)), priorities.sum(axis=1), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_training_refreshes_the_largest_priority_with_the_copies_of_the_targets(trained):
     """A largest priority that no row has any more: rows that got it are drawn at once and get their own."""
     state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(trained.final)  # training donates its state

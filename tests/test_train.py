@@ -383,6 +383,7 @@ def test_a_member_that_diverges_is_frozen_and_the_others_continue(td3):
     assert np.isfinite(hurt.timestep.obs).all()
 
 
+@pytest.mark.slow
 def test_the_bias_distinguishes_overestimation_from_underestimation(monkeypatch):
     """The true value is 5 everywhere. The largest of five critics overestimates, a strong penalty underestimates."""
     settings = {"ensemble_size": 5, "warmup_steps": 100, "lr": 3e-3, "tau": 0.1, "gamma": 0.8, "steps": 1_000}

@@ -24,6 +24,7 @@ def train(cell):
     return run.main(["experiments.run", *cell.command])
 
 
+@pytest.mark.slow
 def test_with_config_the_run_itself_decides_whether_it_is_finished(tmp_path, capsys):
     """The file may have been edited since the run started."""
     file, lines = tmp_path / "grid.yaml", []
