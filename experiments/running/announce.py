@@ -94,7 +94,7 @@ def what_to_expect(env: str, steps: int) -> str:
     still = task.alive * EPISODE_LENGTH
     return (
         f"what to expect: {env} earns {task.alive:g} per step for staying upright: {still:,.0f} for standing still. "
-        "A robot that starts to move falls at first: length and return drop before they rise. "
+        "Moving costs control and leads to falls at first: return and length drop before they rise. "
         f"{steps:,} steps are too few to learn to walk; the speed shows whether it moves"
     )
 
