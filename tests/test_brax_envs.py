@@ -43,6 +43,7 @@ def test_steps_are_braxs(pendulum):
         np.testing.assert_allclose(timestep.reward, state.reward, rtol=1e-6)
 
 
+@pytest.mark.slow  # the contract itself: test_envs
 def test_an_episode_ends_with_its_own_observation_and_the_next_has_a_new_start(pendulum):
     env, step = pendulum
     timestep = env.reset(jax.random.key(0))
