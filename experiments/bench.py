@@ -39,7 +39,7 @@ from experiments.benchmarks import bench_flags, compare
 from experiments.benchmarks.bench_flags import FLAGS, check_flags
 from experiments.benchmarks.machine import machine
 from experiments.benchmarks.session import measure_and_save
-from experiments.running import runtime
+from experiments.surroundings import jax_settings
 from sqt_jax import envs
 
 flags.adopt_module_key_flags(bench_flags)
@@ -51,8 +51,8 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     logging.set_verbosity(logging.WARNING)
     environment = compare.peer_environment() if FLAGS.compare else {}
-    runtime.prepare()
-    runtime.set_cpu_device_count(bench_flags.most_devices())
+    jax_settings.prepare()
+    jax_settings.start_jax(bench_flags.most_devices())
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
     print(", ".join(f"{key}: {value}" for key, value in machine().items()), flush=True)
     request = bench_flags.request()

@@ -18,14 +18,15 @@ from experiments.benchmarks.machine import machine
 from experiments.benchmarks.measure_envs import env_steps
 from experiments.benchmarks.timing import measure_interleaved
 from experiments.commandline import arguments
+from experiments.commandline.path_flags import define_path
 from experiments.gymnasium_parity.parity_report import Cases, Counts, TaskParity, compare_task, physics_cases, report
-from experiments.running import runtime
+from experiments.surroundings import jax_settings
 from sqt_jax.envs import TASKS
 
 flags.DEFINE_integer("states", 256, "States from which a control step is compared.", lower_bound=16)
 flags.DEFINE_integer("starts", 2_000, "Starts of episodes that are compared.", lower_bound=16)
 flags.DEFINE_integer("episodes", 60, "Episodes of a policy with random weights that are compared.", lower_bound=2)
-flags.DEFINE_string("out", "", "Also write the report, which is always printed, to this file.")
+define_path("out", "", "Also write the report, which is always printed, to this file.")
 
 BENCH_FLAGS = ("tasks", "physics", "solver", "seconds", "repeats")  # the benchmark's flags that apply here
 for flag_name in BENCH_FLAGS:
@@ -42,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
         with exit_on_usage_error():
             arguments.reject_file("--out", Path(FLAGS.out), overwrite=True)
     logging.set_verbosity(logging.WARNING)
-    runtime.prepare()
+    jax_settings.prepare()
     cases = physics_cases(physics_here(), solver_limits())
     counts = Counts(states=FLAGS.states, starts=FLAGS.starts, episodes=FLAGS.episodes)
     found: dict[str, TaskParity] = {}

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import BAD_USAGE, DONE, INTERRUPTED, UsageError, printable
-from experiments.running import runtime
+from experiments.surroundings import jax_settings
 from sqt_jax.types import Environment
 
 
@@ -22,7 +22,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
         if options is None:
             print(flag_table.help_text())
             return DONE
-        runtime.prepare()
+        jax_settings.prepare()
         # Imports SciPy, TensorBoard, Orbax and matplotlib: a typing error is reported without waiting for them.
         from experiments.running.session import start_session
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from absl import app, flags, logging
 
 from experiments.endurance.many_steps import SoakFailure, run_soak
-from experiments.running import runtime
+from experiments.surroundings import jax_settings
 from sqt_jax.envs import TASKS
 
 FLAGS = flags.FLAGS
@@ -23,7 +23,7 @@ def main(argv: Sequence[str]) -> None:
     """Runs the test; exits with 1 and a line if it fails."""
     del argv
     logging.set_verbosity(logging.WARNING)
-    runtime.prepare()
+    jax_settings.prepare()
     try:
         run_soak(tuple(TASKS), FLAGS.steps, FLAGS.envs, FLAGS.rounds, lambda line: print(line, flush=True))
     except SoakFailure as failure:

@@ -12,6 +12,7 @@ from pathlib import Path
 from absl import app, flags
 
 from experiments.commandline.arguments import BAD_USAGE, UsageError, printable
+from experiments.commandline.path_flags import define_path
 from experiments.grids.grid import GRIDS, make_cells
 from experiments.grids.train_cells import train_cells, train_in_process
 
@@ -32,6 +33,6 @@ if __name__ == "__main__":
     flags.DEFINE_string("grid", None, f"What to train: {', '.join(GRIDS)}.")
     flags.DEFINE_list("algos", [], "Algorithms, if not the grid's.")
     flags.DEFINE_list("tasks", [], "Tasks, if not the grid's.")
-    flags.DEFINE_string("out", "runs", "Results go to OUT/TASK/ALGO/NAME/.")
+    define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/.")
     # known_only: unknown flags stay in argv.
     app.run(main, flags_parser=lambda argv: FLAGS(argv, known_only=True))

@@ -27,8 +27,8 @@ def run(monkeypatch, tmp_path):
             bench.FLAGS.mark_as_parsed()
             bench.main(["bench"])
 
-    monkeypatch.setattr(bench.runtime, "prepare", lambda: None)
-    monkeypatch.setattr(bench.runtime, "set_cpu_device_count", lambda devices: None)
+    monkeypatch.setattr(bench.jax_settings, "prepare", lambda: None)
+    monkeypatch.setattr(bench.jax_settings, "start_jax", lambda devices: None)
     cached = jax.config.jax_enable_compilation_cache
     yield main
     jax.config.update("jax_enable_compilation_cache", cached)

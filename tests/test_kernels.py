@@ -43,13 +43,13 @@ def test_a_loop_that_is_one_kernel_is_an_operation(kinds):
 
 @pytest.mark.slow
 def test_a_loop_is_one_kernel_where_runs_ask_xla_for_it():
-    """With the option of `experiments.running.runtime`; by default XLA does so only with less data."""
+    """With the option of `experiments.surroundings.jax_settings`; by default XLA does so only with less data."""
     program = """
 import sys
 from experiments.benchmarks import kernels
-from experiments.running import runtime
+from experiments.surroundings import jax_settings
 if sys.argv[1] == "prepared":
-    runtime.prepare()
+    jax_settings.prepare()
 import jax, jax.numpy as jnp
 little = lambda y: jax.lax.fori_loop(0, 50, lambda _, y: jnp.sin(y) + y[::-1], y)
 run = jax.jit(lambda y, steps: jax.lax.fori_loop(0, steps, lambda _, y: jnp.sort(little(y)), y))

@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # The lowest first; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
-    {"sqt_jax.types", "sqt_jax.suggestions"},
+    {"sqt_jax.types", "sqt_jax.suggestions", "sqt_jax.job_limits"},
     {"sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
     {"sqt_jax.settings", "sqt_jax.q_targets", "sqt_jax.networks", "sqt_jax.bias", "sqt_jax.optimizers", "sqt_jax.ring"},
     {"sqt_jax.config", "sqt_jax.replay", "sqt_jax.lap", "sqt_jax.gaussian"},
@@ -23,9 +23,12 @@ LAYERS = [
     {"sqt_jax.experiment"},
     {"sqt_jax.policy"},
     {"sqt_jax"},
+    {"experiments.surroundings"},
     {"experiments"},
-    {"experiments.running.files", "experiments.running.csv_rows", "experiments.evidence.statistics"},
+    {"experiments.running.files", "experiments.evidence.statistics"},
+    {"experiments.running.csv_rows"},
     {"experiments.commandline"},
+    {"experiments.surroundings.jax_settings"},
     {"experiments.running"},
     {"experiments.evidence"},
     {
@@ -47,6 +50,7 @@ LAYERS = [
 PACKAGES = (
     "sqt_jax.agents",
     "sqt_jax.envs",
+    "experiments.surroundings",
     "experiments.commandline",
     "experiments.running",
     "experiments.evidence",
@@ -59,6 +63,7 @@ PACKAGES = (
 )
 # Modules on another layer than the rest of their package.
 OWN_LAYER = {
+    "experiments.surroundings.jax_settings",  # its errors are those of a command line
     "experiments.running.files",
     "experiments.running.csv_rows",
     "experiments.evidence.statistics",

@@ -10,7 +10,7 @@ from experiments.gymnasium_parity.gymnasium_reference import record_episode
 
 @pytest.mark.slow
 def test_the_report_has_a_row_for_every_task_and_physics(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(parity.runtime, "prepare", lambda: None)
+    monkeypatch.setattr(parity.jax_settings, "prepare", lambda: None)
     monkeypatch.setattr(
         parity_report, "record_episode", lambda name, seed, scale: record_episode(name, seed, scale, steps=20)
     )

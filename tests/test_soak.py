@@ -10,7 +10,7 @@ from experiments.endurance.many_steps import SoakFailure
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(soak.runtime, "prepare", lambda: None)
+    monkeypatch.setattr(soak.jax_settings, "prepare", lambda: None)
     soak.FLAGS.mark_as_parsed()
     with flagsaver.flagsaver(steps=200, envs=3, rounds=2):
         yield

@@ -1,4 +1,4 @@
-"""The pool of threads that steps robots, and how many cores a process may use."""
+"""The pool of threads that steps robots."""
 
 import itertools
 import os
@@ -8,17 +8,7 @@ import time
 
 import pytest
 
-from sqt_jax.envs.physics.threads import thread_pool, usable_cores
-
-
-def test_all_cores_count_if_the_system_does_not_limit_them(monkeypatch):
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert usable_cores() == os.cpu_count()
-
-
-def test_cores_that_the_process_may_not_use_do_not_count(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 5, 7}, raising=False)
-    assert usable_cores() == 3
+from sqt_jax.envs.physics.threads import thread_pool
 
 
 def numbered(work):

@@ -15,6 +15,7 @@ from absl import flags
 from experiments.benchmarks import compare, growth
 from experiments.benchmarks.suites import MORE_SUITES, SUITES, Request
 from experiments.commandline import arguments
+from experiments.commandline.path_flags import define_path
 from experiments.evidence.published import PAPERS_TASKS
 from sqt_jax import algorithms, envs
 
@@ -52,14 +53,14 @@ flags.DEFINE_list(
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suites replay and memory.")
 flags.DEFINE_boolean("profile", False, "Also count and time the device operations of the suite loop.")
 flags.DEFINE_boolean("peak", True, "Also measure the peak of matrix products, which updates are compared with.")
-flags.DEFINE_string("figures", "bench", "Folder of the suite growth's figures.")
+define_path("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list(
     "compare", [], f"Other implementations to measure, interleaved with ours: {', '.join(compare.NEEDS)}."
 )
-flags.DEFINE_string("peer_python", sys.executable, "The Python that has the packages --compare needs.")
+define_path("peer_python", sys.executable, "The Python that has the packages --compare needs.")
 flags.DEFINE_integer("repeats", 5, "Timed calls per measurement, of which the median is reported.", lower_bound=1)
 flags.DEFINE_float("seconds", 1.0, "Approximate seconds of one timed call.", lower_bound=0.0)
-flags.DEFINE_string("json", "", "Also write the measurements to this file, again after each of them.")
+define_path("json", "", "Also write the measurements to this file, again after each of them.")
 
 
 def check_flags() -> None:
@@ -138,7 +139,7 @@ def devices_here() -> list[int | None]:
 
 
 def most_devices() -> int:
-    """The largest number of devices that a measurement can use, for `runtime.set_cpu_device_count`."""
+    """The largest number of devices that a measurement can use, for `jax_settings.start_jax`."""
     numbers = [int(value) for value in FLAGS.devices if value != "auto"]
     if "auto" in FLAGS.devices or FLAGS.compare:
         numbers += map(int, FLAGS.members)

@@ -19,7 +19,7 @@ from experiments.benchmarks.measurements import Case, Failure, Measurement, Prep
 from experiments.benchmarks.peer_process import PeerProcesses
 from sqt_jax import envs
 from sqt_jax.envs import gym_table
-from sqt_jax.envs.physics.threads import usable_cores
+from sqt_jax.job_limits import usable_cores
 from sqt_jax.members import usable_devices
 
 NEEDS = {"sbx": "sbx", "torch": "torch"}  # the package that a peer's program imports
@@ -38,7 +38,7 @@ def lacks(peer: str, interpreter: str) -> bool:
 
 
 def peer_environment() -> dict[str, str]:
-    """Environment variables for the peers' processes. Call before JAX starts and before `runtime.prepare`.
+    """Environment variables for the peers' processes. Call before JAX starts and before `jax_settings.prepare`.
 
     Afterwards neither the peers nor this process allocate an accelerator's memory in advance, since they share it.
     """

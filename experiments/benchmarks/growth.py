@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMetho
 from experiments.benchmarks.measure_replays import REPLAYS, replay_case
 from experiments.benchmarks.measure_updates import updates
 from experiments.benchmarks.measurements import Case, Failure, Measurement, measure_cases
-from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS
+from experiments.evidence.figure_style import ALGORITHM_COLOURS, COLOURS, MARKERS, in_our_style
 from experiments.running import files
 from sqt_jax.members import usable_devices
 
@@ -82,6 +82,7 @@ def draw(found: Sequence[Measurement], folder: Path) -> list[Path]:
     return paths
 
 
+@in_our_style
 def _draw(points: dict[str, dict[int, float]], x_label: str, y_label: str, path: Path) -> None:
     figure = Figure(figsize=(5, 3.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -12,7 +12,7 @@ from mujoco import rollout as mujoco_rollout
 from experiments.benchmarks.measurements import Case, Failure, Measurement, measure_cases, member_keys, preparing
 from sqt_jax import envs, rollout
 from sqt_jax.envs import gym_table, gym_tasks
-from sqt_jax.envs.physics.threads import usable_cores
+from sqt_jax.job_limits import usable_cores
 
 
 def bench_env(task: str, members: int, physics: str, **timing: Any) -> Iterator[Measurement | Failure]:

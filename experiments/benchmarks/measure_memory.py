@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.measurements import MEGABYTES, Measurement, member_keys
-from experiments.running import runtime
 from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
+from experiments.surroundings import jax_settings
 from sqt_jax import envs, experiment, train
 from sqt_jax.config import Config
 from sqt_jax.members import layout_here
@@ -63,8 +63,8 @@ def bench_memory(algo: str, task: str, members: int, capacity: int, physics: str
 
 
 def _measured(config: Config, members: int) -> Memory:
-    runtime.prepare()
-    runtime.set_cpu_device_count(members)
+    jax_settings.prepare()
+    jax_settings.start_jax(members)
     started = _peak_bytes()
     trainer = experiment.make_trainer(config)
     replay = experiment.replay_of(config, envs.make(config.env, config.physics))

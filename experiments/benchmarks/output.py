@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-from rich.console import Console
 from rich.table import Table
 
 from experiments.benchmarks import compare, growth, kernels
@@ -14,6 +13,7 @@ from experiments.benchmarks.machine import machine
 from experiments.benchmarks.measurements import Failure, Measurement, with_devices
 from experiments.commandline.arguments import UsageError
 from experiments.running import files
+from experiments.surroundings.consoles import console
 
 HEADER = ("suite", "what", "members", "rate", "unit", "compile s", "GFLOP", "of the peak", "operations per step")
 # The reference of a ratio, by suite and physics.
@@ -63,7 +63,7 @@ def print_all(measurements: Sequence[Measurement], peak: float, figures: Path) -
     table = Table(*HEADER, title="median of repeats")
     for found in measurements:
         table.add_row(*cells(found, peak))
-    Console().print(table)
+    console().print(table)
     print(markdown(measurements, peak))
     print("\n".join(physics_ratios(measurements) + compare.ratios(measurements)))
     try:

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from sqt_jax.envs.physics.threads import usable_cores
+from sqt_jax.job_limits import usable_cores
 
 PEERS = Path(__file__).parent / "peers"
 

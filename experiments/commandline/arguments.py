@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from experiments.running import files
+from experiments.surroundings import paths, streams
 
 # Exit codes of all commands; their meaning: experiments/README.md.
 DONE, FAILED, BAD_USAGE, DIVERGED, INTERRUPTED = 0, 1, 2, 3, 130
@@ -38,7 +39,7 @@ class Parser(argparse.ArgumentParser):
         )
         self.example, self.one = example, one
         name, text = ("RUN", "the folder of a run") if one else ("RUNS", "folders of runs, or folders above them")
-        self.add_argument("runs", nargs="*", metavar=name, help=text)
+        self.add_argument("runs", nargs="*", type=_expanded, metavar=name, help=text)
 
     def read(self, argv: Sequence[str]) -> argparse.Namespace:
         """The values of `argv`, program name first. Exits with 0 after --help. Raises `UsageError`."""
@@ -103,14 +104,21 @@ def folder(text: str) -> Path:
     """The type of a flag that expects a folder, which need not exist."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError("expects a folder")
-    return Path(text)
+    return Path(_expanded(text))
 
 
 def file(text: str) -> Path:
     """The type of a flag that expects a file, which need not exist."""
     if not Path(text).name or text.endswith("/") or "\0" in text:
         raise argparse.ArgumentTypeError("expects a file")
-    return Path(text)
+    return Path(_expanded(text))
+
+
+def _expanded(text: str) -> str:
+    try:
+        return paths.expanded(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def reject_existing(out: Path, names: Sequence[str], overwrite: bool) -> None:
@@ -183,9 +191,15 @@ def printable(text: str, kept: str = "") -> str:
 
 
 def guarded(command: Callable[[Sequence[str]], Any], argv: Sequence[str]) -> int:
-    """Runs a command and returns its exit code. A `UsageError` becomes one line on stderr."""
+    """Runs a command and returns its exit code. A `UsageError` becomes one line on stderr.
+
+    Output that could not be printed is a failure, except if its reader left (`| head`).
+    """
     try:
         command(argv)
+        if lost := streams.lost_output():
+            print(f"the output could not be written: {lost}", file=sys.stderr)
+            return FAILED
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE

@@ -1,6 +1,7 @@
 """Reads a YAML file of settings (`--config=FILE.yaml`) as command-line arguments."""
 
 from collections import Counter
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -8,17 +9,18 @@ import yaml
 
 MAX_BYTES = 100_000
 FOR_THE_COMMAND_LINE = ("config", "help", "resume")
+SWITCH_WORDS = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 
 
 class InvalidConfigFile(ValueError):
     """A file is not a valid file of settings. The text says why, in one line."""
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML without merge keys (`<<`), since a few lines of them can exhaust the memory."""
+class _Loader(yaml.BaseLoader):
+    """YAML whose words and numbers are text as written: `name: no` is "no", not false.
 
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        pass
+    Merge keys (`<<`) are not followed, since a few lines of them can exhaust the memory.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
@@ -28,8 +30,11 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def arguments(path: Path) -> list[str]:
-    """`--name=value` for each line `name: value`; a list of values is joined by commas.
+def arguments(path: Path, switches: Container[str] = ()) -> list[str]:
+    """`--name=value` for each line `name: value`, with the value as written; a list is joined by commas.
+
+    Args:
+      switches: the names that are true or false; YAML's yes, no, on and off count for these.
 
     Raises:
       InvalidConfigFile: there is no such file, or its content is invalid.
@@ -51,13 +56,15 @@ def arguments(path: Path) -> list[str]:
         raise InvalidConfigFile("expects a YAML file, which this is not") from None
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise InvalidConfigFile("expects lines like `steps: 100000`")
-    return [_argument(key, value) for key, value in content.items()]
+    return [_argument(key, value, key in switches) for key, value in content.items()]
 
 
-def _argument(key: str, value: Any) -> str:
+def _argument(key: str, value: Any, switch: bool) -> str:
     if key in FOR_THE_COMMAND_LINE:
         raise InvalidConfigFile(f"{key} is for the command line")
     items = value if isinstance(value, list) else [value]
-    if not items or not all(isinstance(item, bool | int | float | str) for item in items):
+    if not all(isinstance(item, str) for item in items) or not any(items):
         raise InvalidConfigFile(f"{key} expects a number, a word or a list of them")
-    return f"--{key}={','.join(str(item).lower() if isinstance(item, bool) else str(item) for item in items)}"
+    if switch:
+        items = [SWITCH_WORDS.get(item.lower(), item) for item in items]
+    return f"--{key}={','.join(items)}"

@@ -17,6 +17,7 @@ from experiments.commandline import config_file
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Flag, OutputConfig
 from experiments.commandline.presets import PRESETS
+from experiments.surroundings import paths
 from sqt_jax.config import SETTINGS
 from sqt_jax.settings import ConfigError, Setting, settings_of
 from sqt_jax.suggestions import did_you_mean
@@ -105,9 +106,10 @@ def _with_resume_value(argv: Sequence[str]) -> list[str]:
 
 def _file_values(name: str) -> dict[str, Any]:
     """The flags of a YAML file, parsed as those of a command line."""
+    switches = {flag.name for group in FLAGS.values() for flag in group if flag.parse is None}
     try:
-        arguments = config_file.arguments(Path(name))
-    except config_file.InvalidConfigFile as error:
+        arguments = config_file.arguments(Path(paths.expanded(name)), switches)
+    except (config_file.InvalidConfigFile, ValueError) as error:
         raise UsageError(f"--config={name}: {error}") from None
     try:
         return _values(["", *arguments])
@@ -163,9 +165,9 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
         raise UsageError(
             f"--name={name[:40]}: expects up to 200 bytes, no slashes or control characters: it names a folder"
         )
-    for flag, folder in (("out", own["out"]), ("resume", resume if folder_given else None)):
-        if folder is not None and not (folder and _is_path(folder)):
-            raise UsageError(f"--{flag}={folder[:40]}: expects a folder")
+    out = "runs" if own["out"] is None else _folder("out", own["out"])
+    if folder_given:
+        resume = _folder("resume", resume)
 
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
@@ -194,7 +196,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
         settings=settings,
         sweep=sweep,
         preset=preset,
-        out=own["out"] or "runs",
+        out=out,
         name=name,
         resume=resume,
         overwrite=overwrite,
@@ -218,12 +220,18 @@ def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
     return seeds
 
 
-def _is_path(text: str) -> bool:
-    """Whether a file can have this name; a YAML file can ask for one that cannot."""
+def _folder(flag: str, text: str) -> str:
+    """The folder that a flag names; a YAML file can ask for one that no folder can have."""
     try:
-        return b"\0" not in os.fsencode(text)
+        valid = text and b"\0" not in os.fsencode(text)
     except UnicodeEncodeError:
-        return False
+        valid = False
+    if not valid:
+        raise UsageError(f"--{flag}={text[:40]}: expects a folder")
+    try:
+        return paths.expanded(text)
+    except ValueError as error:
+        raise UsageError(f"--{flag}={text[:40]}: {error}") from None
 
 
 def _reject_duplicates(name: str, values: Sequence[Any]) -> None:

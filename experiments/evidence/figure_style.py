@@ -4,6 +4,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
@@ -16,6 +17,10 @@ from experiments.evidence.pooling import AlgorithmRow
 from experiments.evidence.variants import BATCH_STD, TRANSITION_STD, baseline_of, variant_with, variants_of
 from sqt_jax.algorithms import ALGORITHMS
 
+# Figures look the same whatever the user's rc files and notebook say. `svg.hashsalt`: ids in SVG files are not random;
+# `text.parse_math`: a dollar sign in a run's files starts no formula.
+STYLE = ("default", {"svg.hashsalt": "sqt_jax", "text.parse_math": False})
+in_our_style = matplotlib.style.context(list(STYLE))  # a decorator of functions that make or draw figures
 # Okabe and Ito's palette, whose colours colour-blind readers can tell apart; without black and yellow.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", ":")

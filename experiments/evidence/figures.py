@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -22,6 +21,7 @@ from experiments.evidence.figure_style import (
     Stars,
     Style,
     add_texts,
+    in_our_style,
     make_panels,
     style_axes,
     styles,
@@ -38,6 +38,7 @@ LABELS = {
 }
 
 
+@in_our_style
 def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None:
     """Writes one run's figure as a PNG: the return and the critics' disagreement over the environment steps.
 
@@ -73,7 +74,7 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
     right.set_ylabel(LABELS["q_std"])
     left.legend(frameon=False, fontsize="small", loc="best")
     heading = f"{title}: mean and std (ddof 0) over seeds, thin lines: the seeds"
-    figure.suptitle(heading, fontsize="medium", parse_math=False)  # a dollar sign in a name starts no formula
+    figure.suptitle(heading, fontsize="medium")
     figure.savefig(path)
 
 
@@ -91,7 +92,7 @@ def all_figures(collected: Collected, statistic: str) -> dict[str, Callable[[], 
     }
     draw |= {"penalty_sweep": partial(penalty_sweep, collected, statistic)}
     draw |= {"performance_profile": partial(performance_profile, collected)}
-    return {name: partial(_without_formulas, function) for name, function in draw.items()}
+    return {name: in_our_style(function) for name, function in draw.items()}
 
 
 def over_time(collected: Collected, column: str, statistic: str) -> Figure | None:
@@ -172,12 +173,12 @@ def performance_profile(collected: Collected) -> Figure | None:
     return figure
 
 
+@in_our_style
 def image(figure: Figure, kind: str) -> bytes:
     """The figure as `png`, `svg` or `pdf`. Drawing a figure again gives the same bytes of PNG and SVG."""
     stream = io.BytesIO()
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind, {})
-    with matplotlib.rc_context({"svg.hashsalt": "sqt_jax"}):  # else its ids are random
-        figure.savefig(stream, format=kind, metadata=metadata)
+    figure.savefig(stream, format=kind, metadata=metadata)
     return stream.getvalue()
 
 
@@ -186,12 +187,6 @@ def file_contents(draw: Mapping[str, Callable[[], Figure | None]], kind: str) ->
     drawn = {name: function() for name, function in draw.items()}
     contents = {f"{name}.{kind}": image(figure, kind) for name, figure in drawn.items() if figure}
     return contents, [name for name, figure in drawn.items() if figure is None]
-
-
-def _without_formulas(draw: Callable[[], Figure | None]) -> Figure | None:
-    """Draws without formulas: a dollar sign in a run's files is shown as it is."""
-    with matplotlib.rc_context({"text.parse_math": False}):
-        return draw()
 
 
 def _draw_group(axes: Axes, group: Group, column: str, statistic: str, style: Style, opacity: float) -> None:

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.evidence.cells import Cell, ResultTable
+from experiments.surroundings.consoles import UNLIMITED, console
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -26,7 +27,13 @@ LATEX = {
 
 
 def rich_table(table: ResultTable) -> Group:
-    """The table for a rich console."""
+    """The table with its caption and notes, for a rich console."""
+    below = [Text(table.caption, style="italic")]
+    below += [Text(f"({index}) {note}") for index, note in enumerate(table.notes, 1)]
+    return Group(_grid(table), *(Padding(text, (0, 2)) for text in below), Text(""))
+
+
+def _grid(table: ResultTable) -> Table:
     shown = Table(box=SIMPLE_HEAD, title=table.title, title_justify="left", title_style="bold")
     for name in table.header:
         shown.add_column(Text(name), overflow="fold")
@@ -34,15 +41,14 @@ def rich_table(table: ResultTable) -> Group:
         for line in lines:
             shown.add_row(*(Text(_plain(cell)) for cell in line.cells), style="dim" if line.published else "")
         shown.add_section()
-    below = [Text(table.caption, style="italic")]
-    below += [Text(f"({index}) {note}") for index, note in enumerate(table.notes, 1)]
-    return Group(shown, *(Padding(text, (0, 2)) for text in below), Text(""))
+    return shown
 
 
 def terminal(table: ResultTable, width: int = 200) -> str:
-    """The table as plain text, for a file or a pipe."""
+    """The table as plain text, for a file or a pipe: the table as wide as it needs, the notes in lines of `width`."""
+    needed = Console(width=UNLIMITED).measure(_grid(table)).maximum
     stream = io.StringIO()
-    Console(file=stream, width=width, color_system=None).print(rich_table(table))
+    Console(file=stream, width=max(width, needed), color_system=None).print(rich_table(table))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
 
 
@@ -129,7 +135,7 @@ def show(tables: Sequence[ResultTable], name: str) -> None:
     """Prints the tables in a format of `FORMATS`; on a terminal, `terminal` has its width and styles."""
     if name == "terminal" and sys.stdout.isatty():
         for table in tables:
-            Console().print(rich_table(table))
+            console().print(rich_table(table))
     else:
         print("\n".join(FORMATS[name][1](table) for table in tables), end="")
 

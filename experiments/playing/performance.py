@@ -13,7 +13,8 @@ from experiments.playing import brax_pages, episodes, films, graphics, policies,
 from experiments.playing.episodes import PlayedEpisode
 from experiments.playing.play_flags import is_brax
 from experiments.playing.played_task import PlayedTask, make_played_task
-from experiments.running import files, progress, runtime
+from experiments.running import files, progress
+from experiments.surroundings import consoles, jax_settings
 from sqt_jax.rollout import Policy
 
 SIZE = (640, 480)
@@ -31,7 +32,7 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     Raises:
       UsageError: no run or no policy, a flag that does not apply to it, or a film that cannot be written.
     """
-    runtime.prepare()
+    jax_settings.prepare()
     described = policies.read(run)
     returns = policies.final_returns(run, len(described.members))
     chosen = policies.choose(described, returns, options.seed, options.member)
@@ -40,7 +41,7 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     caption = policies.caption(described, chosen)
     print(caption)
     print(f"physics {task.physics}, start seed {options.start_seed}", flush=True)
-    console = Console(stderr=True)
+    console = consoles.console(stderr=True)
     played = play_episodes(task, policy, options, console)
     for number, episode in enumerate(played):
         length = f"{episode.length:,} steps, {episode.length * task.period:.1f} s"

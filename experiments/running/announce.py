@@ -41,6 +41,8 @@ class Announcer:
         if plan.resumed:
             step = "step 0: it has no valid checkpoint" if resumed_at is None else f"step {resumed_at:,}"
             self._line(f"resuming at {step}")
+            if changed := resume.changed_device(plan.resumed, len(plan.layout.devices)):
+                self._line(f"not the device of before, results may differ in their last digits: {', '.join(changed)}")
             if changed := resume.changed_versions(plan.resumed):
                 self._line(f"package versions differ from the run's, results may differ too: {', '.join(changed)}")
         # If the critics estimate another policy than the deterministic one, both are evaluated.
@@ -138,7 +140,7 @@ def final_table(summary: Mapping[str, Any], swept: Sequence[str]) -> Table:
         final, score = group["final"], group["score"]
         table.add_row(
             "mean +- std",
-            f"{len(group['seeds'])} seeds",
+            f"{len(group['seeds'])} seed" + "s" * (len(group["seeds"]) > 1),
             *(f"{group[name]:g}" for name in columns),
             f"{number(final['mean'])} +- {number(final['std'])}",
             f"{number(score['mean'])} +- {number(score['std'])}",

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.running import files
+
 
 class MissingRows(Exception):
     """A table is shorter than it was; the text is its name."""
@@ -69,7 +71,7 @@ class CsvTable:
         """
         if not self.flush():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), self._name)
-        os.fsync(self._file)
+        files.sync(self._file)
         return self._size
 
     def close(self) -> None:

@@ -1,11 +1,13 @@
 """Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
 
+import errno
 import fcntl
+import itertools
 import json
 import math
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,9 +23,16 @@ class Busy(Exception):
         self.process = process
 
 
+# What a file system answers that has no such service: NFS without its lock daemon, FUSE, some clusters' own.
+NOT_SUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
+
+
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, warn: Callable[[str], None] = lambda line: None) -> Iterator[None]:
     """Locks `folder` for this process, by the file `lock` in it. The system unlocks it when the process ends.
+
+    Args:
+      warn: called with a line of text if the file system has no locks; the folder is not locked then.
 
     Raises:
       Busy: another process has locked it.
@@ -36,11 +45,31 @@ def locked(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise Busy(os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()) from None
+        except OSError as error:
+            if error.errno not in NOT_SUPPORTED:
+                raise
+            warn(f"the file system of {folder} has no locks ({error.strerror}): start no other process on this run")
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
         os.close(descriptor)
+
+
+def new_folder(path: Path) -> Path:
+    """Creates `path`, or the first of `path-2`, `path-3`, ... that does not exist yet, and returns it.
+
+    Two processes never get the same folder. Raises `OSError` if none can be created.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            continue
+    raise AssertionError
 
 
 @contextmanager
@@ -52,18 +81,27 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         with part.open("xb") as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())
+            sync(file.fileno())
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
 
 
-def sync_folder(folder: Path) -> None:
-    """Returns when the folder's list of names is on disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync(descriptor: int) -> None:
+    """Returns when an open file is on disk, or at once where the file system cannot say. Raises `OSError`."""
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in NOT_SUPPORTED:
+            raise
+
+
+def sync_folder(folder: Path) -> None:
+    """Returns when the folder's list of names is on disk, as `sync`."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        sync(descriptor)
     finally:
         os.close(descriptor)
 

@@ -13,11 +13,13 @@ import psutil
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.presets import preset_settings
-from experiments.running import records, resume, run_config, runtime
+from experiments.running import records, resume, run_config
 from experiments.running.run_config import Member, RunConfig
+from experiments.surroundings import jax_settings
 from sqt_jax import envs
 from sqt_jax.config import Config, TrainConfig
 from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate
+from sqt_jax.job_limits import memory_limits
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Environment
@@ -85,11 +87,11 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         raise UsageError(f"--physics: {error}") from None
     output = _output(options, target.resumed, config.train)
     layout = _layout(count, output["devices"], typed=options.devices is not None)
-    needed, free = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
+    needed, (free, where) = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
     if needed > free:
         raise UsageError(
             f"--replay_capacity={config.train.replay_capacity}: {count} members need about "
-            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; expects a smaller number, or fewer --seeds"
+            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free {where}; expects a smaller number, or fewer --seeds"
         )
     return Plan(
         members=target.members,
@@ -140,7 +142,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
             make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
-        runtime.set_cpu_device_count(options.devices or len(configs) * len(options.seeds))  # before JAX starts
+        jax_settings.start_jax(options.devices or len(configs) * len(options.seeds))
         if env is None:
             check_physics(configs[0])
     except ConfigError as error:
@@ -256,17 +258,10 @@ def name_taken(path: Path) -> UsageError:
     )
 
 
-def _free_memory(devices: int) -> int:
-    """Bytes available to a run: of the accelerators, or of the machine's memory and its container's limit."""
+def _free_memory(devices: int) -> tuple[int, str]:
+    """Bytes available to a run, and what limits them: the accelerators, the machine or a limit of the job."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
-        return devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))
-    free = psutil.virtual_memory().available
-    try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
-        cached = re.search(r"^inactive_file (\d+)$", Path("/sys/fs/cgroup/memory.stat").read_text(), re.MULTILINE)
-        reclaimable = int(cached[1]) if cached else 0
-        return free if limit == "max" else min(free, int(limit) - used + reclaimable)
-    except OSError:
-        return free
+        return devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0)), "on the devices"
+    found = [(limit.left, f"under {limit.name}") for limit in memory_limits()]
+    return min([(psutil.virtual_memory().available, "here"), *found])

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.commandline.arguments import UsageError
-from experiments.running import records, run_config, runtime
+from experiments.running import records, run_config
 from experiments.running.run_config import Member, RunConfig
+from experiments.surroundings import jax_settings
 from sqt_jax.config import check_train
 from sqt_jax.experiment import check_physics
 from sqt_jax.settings import ConfigError
@@ -46,7 +47,7 @@ def check(path: Path, run: RunConfig, wanted: Mapping[str, Any], devices: int | 
         raise UsageError(f"--resume={path}: {problem}")
     steps = wanted.get("steps", run.members[0].config.train.steps)
     members = [_with_train(_with_eval_physics(member, run), steps=steps) for member in run.members]
-    runtime.set_cpu_device_count(devices or len(members))  # before JAX starts
+    jax_settings.start_jax(devices or len(members))
     config = members[0].config
     try:
         check_train(config.train)
@@ -107,6 +108,16 @@ def changed_versions(run: RunConfig) -> list[str]:
     """Packages whose version is not the run's, as `jax 0.9.0 -> 0.10.2`."""
     old, new = run.content["versions"], run_config.versions()
     return [f"{name} {_text(old.get(name))} -> {new[name]}" for name in new if old.get(name) != new[name]]
+
+
+def changed_device(run: RunConfig, num_devices: int) -> list[str]:
+    """What differs from the device that the run was last trained on, as `cores 4 -> 2`."""
+    resumed = run.content["resumed"][-1:]
+    entries = [run.content, *(entry for entry in resumed if isinstance(entry, dict))]
+    devices = [entry["device"] for entry in entries if isinstance(entry.get("device"), dict)]
+    old, new = devices[-1] if devices else {}, run_config.device_here(num_devices)
+    compared = [name for name in ("platform", "kind", "devices", "cores") if name in old and old[name] != new[name]]
+    return [f"{name} {_text(old[name])} -> {new[name]}" for name in compared]
 
 
 def _problem(run: RunConfig, wanted: Mapping[str, Any]) -> str | None:

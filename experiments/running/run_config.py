@@ -23,6 +23,7 @@ from experiments.running import files
 from sqt_jax import envs
 from sqt_jax.config import Config
 from sqt_jax.experiment import OWN_PHYSICS, eval_physics_of, make_config
+from sqt_jax.job_limits import usable_cores
 from sqt_jax.settings import ConfigError
 from sqt_jax.types import Environment, Scalars
 
@@ -78,9 +79,9 @@ def new_content(
     preset: str,
     output: Mapping[str, Any],
     own_env: Environment | None = None,
+    num_devices: int = 1,
 ) -> dict[str, Any]:
-    """The content of config.json for a run that starts now."""
-    device = jax.local_devices()[0]
+    """The content of config.json for a run that starts now on `num_devices` devices."""
     content = {
         "settings": members[0].config.flat(),
         "preset": preset,
@@ -95,12 +96,19 @@ def new_content(
         "output": dict(output),
         "command": list(command),
         "started": _now(),
-        "device": {"platform": device.platform, "kind": device.device_kind, "cpus": os.cpu_count()},
+        "device": device_here(num_devices),
         "commit": _commit(),
         "versions": versions(),
         "resumed": [],
     }
     return content if own_env is None else content | {"own_env": sizes_of(own_env)}
+
+
+def device_here(num_devices: int) -> dict[str, Any]:
+    """What a run computes on: the number of devices, their kind, and the cores that this process may use."""
+    device = jax.local_devices()[0]
+    kind = {"platform": device.platform, "kind": device.device_kind}
+    return kind | {"devices": num_devices, "cores": usable_cores(), "cpus": os.cpu_count()}
 
 
 def read(path: Path) -> RunConfig:
@@ -160,11 +168,16 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def resumed_content(
-    content: dict[str, Any], steps: int, output: Mapping[str, Any], env_steps: int, command: Sequence[str]
+    content: dict[str, Any],
+    steps: int,
+    output: Mapping[str, Any],
+    env_steps: int,
+    command: Sequence[str],
+    num_devices: int = 1,
 ) -> dict[str, Any]:
     """The content of config.json for a run that is resumed at `env_steps` and trained to `steps`."""
     entry = {"env_steps": env_steps, "at": _now(), "command": list(command)}
-    entry |= {"commit": _commit(), "versions": versions()}
+    entry |= {"commit": _commit(), "versions": versions(), "device": device_here(num_devices)}
     settings = content["settings"] | {"steps": steps}
     return content | {"settings": settings, "output": dict(output), "resumed": [*content["resumed"], entry]}
 

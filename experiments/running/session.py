@@ -8,7 +8,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 
 from experiments.commandline.arguments import (
     DIVERGED,
@@ -29,6 +28,7 @@ from experiments.running.plan import Plan, make_plan, name_taken, not_only_a_run
 from experiments.running.progress import Display
 from experiments.running.run_config import Member
 from experiments.running.signals import stop_on_signal
+from experiments.surroundings.consoles import console
 from sqt_jax.experiment import make_trainer, replay_of
 from sqt_jax.policy import save_policy
 from sqt_jax.train import TrainState, make_sweep
@@ -36,8 +36,17 @@ from sqt_jax.types import Array, Environment, Scalars
 
 
 def start_session(options: Options, env: Environment | None, command: Sequence[str]) -> "Session":
-    """The session of a parsed command line. Raises `UsageError` as `make_plan`."""
-    return Session(make_plan(options, env), command)
+    """The session of a parsed command line. Raises `UsageError` as `make_plan`.
+
+    A run without a --name gets a folder of its own, also if another process chose the same name at the same time.
+    """
+    plan = make_plan(options, env)
+    if options.name is None and plan.resumed is None:
+        try:
+            plan = plan._replace(path=files.new_folder(plan.path))
+        except OSError as error:
+            raise _cannot_write(plan, error) from None
+    return Session(plan, command)
 
 
 class Session:
@@ -50,7 +59,7 @@ class Session:
 
     def __init__(self, plan: Plan, command: Sequence[str]):
         self.plan, self.command = plan, command
-        self.console = Console()
+        self.console = console()
         self.display = Display(self.console, plan.train.steps, quiet=plan.options.quiet)
         self.announcer = Announcer(self.console, plan)
         trainer = make_trainer(plan.config, plan.own_env)
@@ -93,7 +102,14 @@ class Session:
                 self.store.remove_others()
             resumed_at = self.restored.position.env_steps if self.restored else None
             self.announcer.start(resumed_at, self.store.sizes(self.template))
-            outcome = self._train(tables, lambda: bool(received))
+            try:
+                outcome = self._train(tables, lambda: bool(received))
+            except (MemoryError, jax.errors.JaxRuntimeError) as error:
+                if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+                    raise
+                text = f"out of memory ({_one_line(error)}): fewer --seeds or a smaller --replay_capacity need less"
+                print(printable(text), file=sys.stderr)
+                return FAILED
             try:
                 curves = self._write_results(outcome)
                 summary = tables.summary(outcome)  # last: its existence says that the run has ended
@@ -110,17 +126,13 @@ class Session:
         path, resumed = self.plan.path, self.plan.resumed
         with ExitStack() as stack:
             try:
-                stack.enter_context(files.locked(path))
+                stack.enter_context(files.locked(path, self.display.message))
             except files.Busy as busy:
                 flag = f"--resume={path}" if resumed else f"--name={path.name}"
                 raise UsageError(f"{flag}: process {busy.process} is training {path}; expects another run") from None
             except OSError as error:
-                raise self._cannot_write(error) from None
+                raise _cannot_write(self.plan, error) from None
             yield
-
-    def _cannot_write(self, error: OSError) -> UsageError:
-        flag = f"--resume={self.plan.path}" if self.plan.resumed else f"--out={self.plan.options.out}"
-        return UsageError(f"{flag}: expects a folder that can be written: {error}")
 
     def _restore(self) -> Restored | None:
         """The latest valid checkpoint; None: the run has none yet and starts at step 0."""
@@ -151,24 +163,32 @@ class Session:
             if records.is_taken(plan.path):
                 raise name_taken(plan.path)
             content = run_config.new_content(
-                plan.members, plan.swept, self.command, plan.options.preset, plan.output, plan.own_env
+                plan.members,
+                plan.swept,
+                self.command,
+                plan.options.preset,
+                plan.output,
+                plan.own_env,
+                len(plan.layout.devices),
             )
             run_config.write(plan.path, content)
         except records.NotARun:
             raise not_only_a_run(plan.path) from None
         except OSError as error:
-            raise self._cannot_write(error) from None
+            raise _cannot_write(self.plan, error) from None
 
     def _record_resumption(self, run: run_config.RunConfig) -> None:
         """Adds this process to config.json, and removes summary.json, which says that the run has ended."""
         plan = self.plan
         at = self.restored.position.env_steps if self.restored else 0
         try:
-            content = run_config.resumed_content(run.content, plan.train.steps, plan.output, at, self.command)
+            content = run_config.resumed_content(
+                run.content, plan.train.steps, plan.output, at, self.command, len(plan.layout.devices)
+            )
             run_config.write(plan.path, content)
             self._summary.unlink(missing_ok=True)
         except OSError as error:
-            raise self._cannot_write(error) from None
+            raise _cannot_write(self.plan, error) from None
 
     def _open_tables(self) -> records.Records:
         """The run's tables: empty ones, or those of a resumed run, cut to their length at its checkpoint."""
@@ -190,7 +210,7 @@ class Session:
                 f"--resume={plan.path}: expects a run of this version; {error} has other columns"
             ) from None
         except OSError as error:
-            raise self._cannot_write(error) from None
+            raise _cannot_write(self.plan, error) from None
 
     def _train(self, tables: records.Records, stop: Callable[[], bool]) -> Outcome:
         def save(state: TrainState, position: Position) -> None:
@@ -229,8 +249,17 @@ class Session:
         table = records.read_evaluations(plan.path / "evaluations.csv")
         if not len(table["member"]):
             return False
-        figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+        try:
+            figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+        except Exception as error:  # of any type: no fault of a figure may cost the summary
+            self.display.message(f"no curves.png: {_one_line(error)}; experiments.plots draws it later")
+            return False
         return True
+
+
+def _cannot_write(plan: Plan, error: OSError) -> UsageError:
+    flag = f"--resume={plan.path}" if plan.resumed else f"--out={plan.options.out}"
+    return UsageError(f"{flag}: expects a folder that can be written: {error}")
 
 
 def _init_arguments(members: Sequence[Member]) -> tuple[Array, Scalars]:
@@ -239,3 +268,7 @@ def _init_arguments(members: Sequence[Member]) -> tuple[Array, Scalars]:
     agents = [member.config.agent for member in members]
     scalars = (jnp.array([getattr(agent, name) for agent in agents], jnp.float32) for name in Scalars._fields)
     return jax.vmap(jax.random.key)(seeds), Scalars(*scalars)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]

@@ -1,26 +1,28 @@
-"""Stopping a run cleanly on Ctrl-C (SIGINT) and SIGTERM."""
+"""Stopping a run cleanly: on Ctrl-C (SIGINT), SIGTERM, and the signals by which a system announces an end."""
 
 import math
 import os
 import signal
-import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from experiments.commandline.arguments import INTERRUPTED
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# A terminal that closes; what batch systems send before a time limit (SLURM's --signal); a limit of CPU time.
+ANNOUNCEMENTS = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
 SAME_SIGNAL_SECONDS = 1.0
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM in the list that it yields; a second signal ends the process at once.
+    """Collects the signals in the list that it yields; a second SIGINT or SIGTERM ends the process at once.
 
     A SIGTERM within a second of another one counts as the same: with a batch system, both the system and
-    `experiments.sweep`, which forwards its own, send one to this process.
+    `experiments.sweep`, which forwards its own, send one to this process. A signal that is ignored stays so (`nohup`).
     """
     received: list[int] = []
     last_sigterm = -math.inf
@@ -31,15 +33,19 @@ def stop_on_signal() -> Iterator[list[int]]:
             since, last_sigterm = time.monotonic() - last_sigterm, time.monotonic()
             if since < SAME_SIGNAL_SECONDS:
                 return
-        if received:
+        if number in SIGNALS and any(earlier in SIGNALS for earlier in received):
             # Not by an exception: it could be raised inside a callback of the compiled program.
             os._exit(INTERRUPTED)
+        if not received:
+            # Not by print, which may be the very call that is interrupted.
+            with suppress(OSError):
+                os.write(2, b"stopping when the running chunk of training or evaluation ends\n")
         received.append(number)
-        print("stopping when the running chunk of training or evaluation ends", file=sys.stderr)
 
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    for number in SIGNALS:
-        signal.signal(number, handle)
+    handled = [*SIGNALS, *(number for number in ANNOUNCEMENTS if signal.getsignal(number) != signal.SIG_IGN)]
+    if threading.current_thread() is not threading.main_thread():
+        handled = []  # Python allows handlers in the main thread only: signals are its caller's
+    before = {number: signal.signal(number, handle) for number in handled}
     try:
         yield received
     finally:

@@ -14,8 +14,8 @@ import numpy as np
 from rich.console import Console
 
 from experiments.commandline import arguments
-from experiments.running import runtime
 from experiments.running.progress import format_seconds
+from experiments.surroundings import consoles, jax_settings
 from experiments.theorem import claims, contraction, mdps, q_learning, summary, value_figure
 from experiments.theorem.learning_curves import LearningCurves, Names
 
@@ -57,10 +57,8 @@ def run(settings: StudySettings, out: Path, command: str) -> None:
     Raises:
       UsageError: `out` cannot be written.
     """
-    runtime.prepare()
-    console = Console()
-    if not console.is_terminal:
-        console.width = 132
+    jax_settings.prepare()
+    console = consoles.console()
     results = _learn_all(settings, console)
     sqt = settings.algorithms()["sqt"]
     expansions = contraction.expansions(sqt, settings.coefs, settings.ddof, contraction.PAIRS)

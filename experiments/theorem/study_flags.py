@@ -12,6 +12,7 @@ from absl import flags as absl_flags
 from experiments.commandline import arguments
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.flags import ABSL_FLAGS
+from experiments.commandline.path_flags import define_path
 from experiments.theorem import mdps, q_learning, study
 from sqt_jax.suggestions import did_you_mean, expects_one_of
 
@@ -40,7 +41,7 @@ def define_flags() -> absl_flags.FlagValues:
     define(number, "epsilon", 1.0, "Share of random actions; 1: uniform.", lower_bound=0.0, upper_bound=1.0)
     define(number, "init_std", 0.0, "Std of the tables' initial values.", lower_bound=0.0)
     define(number, "weighted_c", 1.0, "Weighted Double Q-learning's c, above 0.", lower_bound=0.0)
-    define(absl_flags.DEFINE_string, "out", "runs/tabular", "Folder of the results.")
+    define(define_path, "out", "runs/tabular", "Folder of the results.")
     define(absl_flags.DEFINE_boolean, "overwrite", False, "Replace the results in the folder.")
     return values
 

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from experiments.evidence.figure_style import COLOURS
+from experiments.evidence.figure_style import COLOURS, in_our_style
 from experiments.theorem import mdps
 from experiments.theorem.learning_curves import LearningCurves, Names, collapsed, interval
 
@@ -34,6 +34,7 @@ def _shade(colour: str, share: float) -> tuple[float, float, float]:
     return tuple(c * (1 - 0.8 * (share - 0.5)) for c in (red, green, blue))  # type: ignore[return-value]
 
 
+@in_our_style
 def draw(results: Mapping[Names, LearningCurves], file: Path | BinaryIO) -> None:
     """Writes a PNG with a panel per MDP and quantity: means over seeds and their 95 % intervals over the steps."""
     names = list(dict.fromkeys(mdp for mdp, _ in results))

@@ -17,7 +17,8 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from sqt_jax.envs.physics import Physics, PhysicsState, Setup
-from sqt_jax.envs.physics.threads import thread_pool, usable_cores
+from sqt_jax.envs.physics.threads import thread_pool
+from sqt_jax.job_limits import usable_cores
 from sqt_jax.types import Array
 
 # The parts of MuJoCo's state that are passed, in this order: qpos [nq], qvel [nv], qacc_warmstart [nv], ctrl [nu].

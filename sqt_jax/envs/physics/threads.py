@@ -1,14 +1,9 @@
-"""The threads on which `mujoco_c` steps robots on the host, and the number of cores that the process may use."""
+"""The threads on which `mujoco_c` steps robots on the host."""
 
 import os
 import queue
 import threading
 from collections.abc import Callable
-
-
-def usable_cores() -> int:
-    """The number of CPU cores this process may use (where the system does not say, as on macOS: all of them)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class ThreadPool:

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import test_plan
 
-from sqt_jax.envs.physics.threads import usable_cores
+from sqt_jax.job_limits import usable_cores
 
 ROOT = Path(__file__).parents[1]
 PROGRAM = """
 import sys
 from experiments.commandline import flags
-from experiments.running import runtime
-runtime.prepare()
+from experiments.surroundings import jax_settings
+jax_settings.prepare()
 from experiments.running.plan import make_plan
 print(len(make_plan(flags.parse(["run", *sys.argv[1:]])).layout.devices))
 import jax
-runtime.set_cpu_device_count(99)  # too late: without effect, and no error
+jax_settings.start_jax(99)  # too late: without effect, and no error
 print(len(jax.local_devices()))
 """
 
