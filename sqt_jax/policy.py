@@ -3,13 +3,14 @@
 policy/config.json     settings, and the sizes of observations and actions
 policy/member_0.npz    the parameters that member 0 needs to act, by path ("params/layer0/kernel")
 policy/act.stablehlo   the function (arrays of a member by path, obs [B, O]) -> action [B, A] for any B, made by
-                       `jax.export` (https://docs.jax.dev/en/latest/export/export.html): it runs without this package
+                       `jax.export` (https://docs.jax.dev/en/latest/export/export.html): it runs without this package.
+                       Loading does not need it, and checkpoints have none
 """
 
 import json
 import math
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
+from sqt_jax import policy_folders
 from sqt_jax.algorithms import make_parts
 from sqt_jax.config import Config
 from sqt_jax.experiment import agent_of, make_config
@@ -26,6 +28,7 @@ from sqt_jax.types import Agent, Array, Environment, State
 
 MAX_CONFIG_BYTES = 1_000_000
 MAX_SIZE = 1_000_000  # of an observation or an action
+EXPORTED = "act.stablehlo"
 
 
 def save_policy(
@@ -51,30 +54,83 @@ def save_policy(
     expected = {name: leaf.shape for name, leaf in by_path(_shapes(agent)).items()}
     if {name: array.shape[1:] for name, array in arrays.items()} != expected:
         raise ValueError(f"agent_state: expected that of {config.algo} with a leading axis of members, [S, ...]")
+    write_policies(directory, config, env, {name: array[:members] for name, array in arrays.items()})
+    (directory / EXPORTED).write_bytes(export_policy(config, env))
+
+
+def write_policies(directory: Path, config: Config, env: Environment, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write policies to a new directory, without act.stablehlo.
+
+    Args:
+      arrays: the policies' parameters by path, [S, ...] each.
+
+    Raises:
+      FileExistsError: the directory exists.
+    """
     directory.mkdir(parents=True)
     sizes = {"observation_size": env.observation_size, "action_size": env.action_size}
     (directory / "config.json").write_text(json.dumps(config.flat() | sizes, indent=1) + "\n")
-    (directory / "act.stablehlo").write_bytes(_exported(agent, env.observation_size))
-    num_members = next(iter(arrays.values())).shape[0] if members is None else members
-    for member in range(num_members):
+    for member in range(len(next(iter(arrays.values())))):
         np.savez(directory / f"member_{member}.npz", **{name: array[member] for name, array in arrays.items()})
 
 
-def load_policy(directory: Path | str, member: int = 0) -> Callable[[Array], Array]:
+def export_policy(config: Config, env: Environment) -> bytes:
+    """The content of act.stablehlo: the policy as a function of its arrays by path and the observations."""
+    agent = agent_of(config, env)
+    policy = _shapes(agent)
+
+    def act(arrays: dict[str, Array], obs: Array) -> Array:
+        params = from_paths(policy, arrays)
+        return agent.views.policy_action(params, obs)
+
+    (batch,) = jax.export.symbolic_shape("batch")
+    obs = jax.ShapeDtypeStruct((batch, env.observation_size), jnp.float32)
+    exported = jax.export.export(jax.jit(act), platforms=("cpu", "cuda", "tpu"))(by_path(policy), obs)
+    return bytes(exported.serialize())
+
+
+def read_policies(directory: Path, config: Config, env: Environment, members: int) -> dict[str, np.ndarray]:
+    """The parameters of the first `members` policies in a directory by path, [S, ...] each.
+
+    Raises:
+      FileNotFoundError: a member's file is missing.
+      ValueError: a file is damaged, or does not have the parameters of `config` and the sizes of `env`.
+    """
+    expected = by_path(_shapes(agent_of(config, env)))
+    read = [_read_arrays(directory / f"member_{member}.npz", expected) for member in range(members)]
+    found = [arrays for arrays in read if arrays is not None]
+    if len(found) < members:
+        raise ValueError(f"{directory}: does not have the parameters of {config.algo} on {config.env}")
+    return {name: np.stack([arrays[name] for arrays in found]) for name in expected}
+
+
+def load_policy(directory: Path | str, member: int = 0, best: bool = False) -> Callable[[Array], Array]:
     """Load the deterministic policy of one member.
 
     Args:
-      directory: written by `save_policy`.
+      directory: written by `save_policy`; or the folder of a run: its policy/ or, before training has ended, that of
+        its newest checkpoint.
       member: its number, from 0.
+      best: of a run, the policy of the member's best evaluation (policy_best/) in place of the last one.
 
     Returns:
       A compiled function obs [B, O] -> action [B, A] in [-1, 1]. It raises ValueError for other sizes of obs.
 
     Raises:
       FileNotFoundError: the directory has no policy, or no such member.
-      ValueError: a file is damaged, or the parameters do not fit the algorithm and sizes in config.json.
+      ValueError: a file is damaged, or the parameters do not fit the algorithm and sizes in config.json; `best` is
+        given and the directory is not the folder of a run.
     """
     directory = Path(directory)
+    if policy_folders.is_run(directory):
+        return policy_folders.read_first(directory, best, lambda folder: _load(folder, member))[0]
+    if best:
+        raise ValueError(f"best: expects the folder of a run, not {directory}")
+    return _load(directory, member)
+
+
+def _load(directory: Path, member: int) -> Callable[[Array], Array]:
+    """The policy of a member in a folder written by `write_policies`. Raises as `load_policy`."""
     config, sizes = _read_config(directory / "config.json")
     agent = make_parts(config.algo, config.agent, *sizes).agent
     expected = _shapes(agent)
@@ -141,6 +197,8 @@ def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] 
                         raise ValueError(f"{name} is truncated or too long")
                     arrays[name] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
             return arrays
+    except FileNotFoundError:  # removed just now
+        raise FileNotFoundError(f"{path}: there is no such file") from None
     except Exception as error:  # of any type: zipfile and NumPy raise many for a file that is damaged
         raise ValueError(f"{path}: not the parameters of a policy: {_one_line(error)}") from None
 
@@ -153,17 +211,3 @@ def _one_line(error: Exception) -> str:
 def _shapes(agent: Agent) -> Any:
     """The parameters that one member needs to act, as shapes and types."""
     return jax.eval_shape(lambda: agent.views.policy(agent.init(jax.random.key(0))))
-
-
-def _exported(agent: Agent, observation_size: int) -> bytes:
-    """The policy as a function of its arrays by path and the observations, serialised as StableHLO."""
-    policy = _shapes(agent)
-
-    def act(arrays: dict[str, Array], obs: Array) -> Array:
-        params = from_paths(policy, arrays)
-        return agent.views.policy_action(params, obs)
-
-    (batch,) = jax.export.symbolic_shape("batch")
-    obs = jax.ShapeDtypeStruct((batch, observation_size), jnp.float32)
-    exported = jax.export.export(jax.jit(act), platforms=("cpu", "cuda", "tpu"))(by_path(policy), obs)
-    return bytes(exported.serialize())

@@ -113,7 +113,7 @@ def add_policies(path, env, returns=None):
     # by NumPy: compiling the agent's own `init` takes seconds
     state = jax.tree.map(lambda leaf: generator.normal(0, 0.5, leaf.shape).astype(leaf.dtype), shapes)
     with mock.patch(
-        "sqt_jax.policy._exported", return_value=b""
+        "sqt_jax.policy.export_policy", return_value=b""
     ):  # the exported program takes seconds and is not needed
         save_policy(path / "policy", config, env, state)
     if returns is not None:

@@ -178,6 +178,31 @@ def disk_is_full_for_the_manifest(monkeypatch):
     monkeypatch.setattr(files, "atomic_file", atomic_file)
 
 
+def test_further_files_are_written_into_the_checkpoint_and_verified_with_it(case, tmp_path):
+    def write_more(folder):
+        (folder / "more").mkdir()
+        (folder / "more" / "file").write_text("mine")
+
+    store = case.store(tmp_path)
+    case.saved(store, 60)
+    store.save(case.trained(70), position(70), LENGTHS, write_more)
+    store.wait()
+    folder = case.store(tmp_path).restore(case.template).folder
+    assert folder == store.path / "step_0000000070" and (folder / "more" / "file").read_text() == "mine"
+    (folder / "more" / "file").write_text("other")
+    assert case.store(tmp_path).restore(case.template).position == position(60)
+    assert "more/file is damaged" in case.said[0]
+
+    def fails(folder):
+        write_more(folder)
+        full()
+
+    store = case.store(tmp_path)
+    store.save(case.trained(80), position(80), LENGTHS, fails)
+    store.wait()
+    assert "no checkpoint at step 80" in case.said[0] and not list(store.path.glob("step_0000000080*"))
+
+
 @pytest.mark.parametrize(
     "fault",
     [disk_is_full_for_rows, disk_is_full_for_the_state, disk_is_full_for_the_manifest],
@@ -277,7 +302,7 @@ def test_another_format_is_rejected_and_kept(case, tmp_path, monkeypatch):
     case.saved(store, 50, 60)
     before = listing(store)
     monkeypatch.setattr(manifests, "FORMAT", 99)
-    with pytest.raises(CannotResume, match="are of format '4', not 99"):
+    with pytest.raises(CannotResume, match="are of format '5', not 99"):
         case.store(tmp_path).restore(case.template)
     assert listing(store) == before
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.run import main
-from experiments.running import records, session
+from experiments.running import records, run_policies
 from sqt_jax.envs import physics
 from sqt_jax.experiment import make_config
 
@@ -48,6 +48,17 @@ def test_the_files_of_a_run(finished):
     names = {item.name for item in path.iterdir()}
     assert {"config.json", "evaluations.csv", "metrics.csv", "summary.json", "curves.png", "tensorboard"} <= names
     assert not any(name.endswith(".part") for name in names)
+
+
+def test_the_best_policies_are_those_of_the_best_evaluations_of_the_summary(finished):
+    _, path = finished
+    summary = json.loads((path / "summary.json").read_text())
+    best = [(entry["best_return"], entry["best_env_steps"]) for entry in summary["members"]]
+    assert [*run_policies.read_evaluations(path / "policy_best").values()] == best and len(best) == 4
+    assert {item.name for item in (path / "policy_best").iterdir()} == {
+        "best.json",
+        *(item.name for item in (path / "policy").iterdir()),
+    }
 
 
 @pytest.mark.slow
@@ -311,7 +322,7 @@ def test_the_summary_is_the_last_file(tmp_path, capsys, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(session, "save_policy", full)
+    monkeypatch.setattr(run_policies, "write_policies", full)
     assert run(tmp_path, "--penalty_coef=0,0.5", "--quiet") == 1
     assert "the results cannot be written: " in capsys.readouterr().err
     assert not (tmp_path / "ant" / "sac_sqt" / "run" / "summary.json").exists()

@@ -44,7 +44,7 @@ class Recorder:
         return evaluation, {"value_bias": np.array([1.5, -2.5])}
 
     def run(self, stop=lambda: False, **options):
-        self.saved = []
+        self.saved, self.kept = [], []
         at = options.get("start", Position()).env_steps
         self.done = at
         state = TrainState(
@@ -68,6 +68,7 @@ class Recorder:
             stop=stop,
             clock=lambda: self.now,
             save=lambda state, position: self.saved.append(position),
+            evaluated_at=lambda state, env_steps, returns: self.kept.append((int(state.env_steps), env_steps, returns)),
             **options,
         )
 
@@ -83,6 +84,14 @@ def test_evaluations_are_at_zero_every_interval_and_the_end():
     assert recorder.reports[2].returns.tolist() == [[1_000, 1_002], [0, 0]]
     assert all(report.bias["value_bias"].tolist() == [1.5, -2.5] for report in recorder.reports)
     assert (outcome.env_steps, outcome.interrupted, outcome.diverged) == (2_000, False, {})
+
+
+def test_the_policies_of_each_evaluation_may_be_kept():
+    recorder = Recorder(TRAIN, breaks_at=800)
+    recorder.run()
+    assert [(at, steps) for at, steps, _ in recorder.kept] == [(at, at) for at in (0, 500, 1_000, 1_500, 2_000)]
+    for (_, _, returns), report in zip(recorder.kept, recorder.reports, strict=True):
+        np.testing.assert_array_equal(returns, report.returns)  # NaN of a member that has diverged
 
 
 def test_the_full_protocol_has_201_evaluations():

@@ -67,7 +67,7 @@ def test_an_environment_of_ones_own_from_start_to_end(tmp_path, monkeypatch, cap
 
     capsys.readouterr()
     assert play.main(["play", path]) == 2
-    assert f"sqt_jax.load_policy('{path}/policy') and sqt_jax.evaluate_policy(policy, env)" in capsys.readouterr().err
+    assert f"sqt_jax.load_policy('{path}') and sqt_jax.evaluate_policy(policy, env)" in capsys.readouterr().err
     policy = sqt_jax.load_policy(f"{path}/policy", member=1)
     returns, lengths = sqt_jax.evaluate_policy(policy, env, num_episodes=3)
     assert returns.shape == (3,) and (lengths <= 10).all()

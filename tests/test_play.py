@@ -49,7 +49,7 @@ BRAX = "runs/brax:inverted_pendulum/td3/run"
 OWN = "runs/cheetah/td3/run"
 BY_PYTHON = (
     f"{OWN}: expects a run on one of the library's environments; this one's was handed in from Python: there, use "
-    f"sqt_jax.load_policy('{OWN}/policy') and sqt_jax.evaluate_policy(policy, env)"
+    f"sqt_jax.load_policy('{OWN}') and sqt_jax.evaluate_policy(policy, env)"
 )
 
 
@@ -80,7 +80,8 @@ def test_the_returns_are_an_evaluations_and_the_film_is_of_those_episodes(folder
     assert play.main(argv) == 0
     out, err = capsys.readouterr()
     assert out.startswith(
-        "td3 on hopper: member 1, seed 5 (the best of 2 at the last evaluation)\nphysics mujoco, start seed 7\n"
+        "td3 on hopper: member 1, seed 5 (the best of 2 at the last evaluation)\n"
+        "physics mujoco, start seed 7, policy: the last one\n"
     )
     policy = sqt_jax.load_policy(f"{RUN}/policy", member=1)
     returns, lengths = sqt_jax.evaluate_policy(policy, envs.make("hopper", "mujoco"), num_episodes=3, seed=7)
@@ -96,8 +97,12 @@ def test_the_returns_are_an_evaluations_and_the_film_is_of_those_episodes(folder
 
 
 def test_a_member_is_named_and_steps_are_limited(folder, capsys):
+    """On a run that was killed: its policies are in a checkpoint."""
+    (folder / RUN / "checkpoint" / "step_0000050000").mkdir(parents=True)
+    (folder / RUN / "policy").rename(folder / RUN / "checkpoint" / "step_0000050000" / "policy")
     assert play.main(["play", RUN, "--seed=3", "--steps=4"]) == 0
     out = capsys.readouterr().out
+    assert "policy: the last one, from the checkpoint at step 50,000\n" in out
     assert "member 0, seed 3 (of 2)" in out and "4 steps, 0.0 s, cut off" in out
     assert out.endswith("no display here: --video=FILE writes a film\n")
 
@@ -130,6 +135,8 @@ REJECTED = [
     (f"{RUN} --seed=" + "9" * 5000, "--seed: expects a whole number"),
     (f"{RUN} --member=2", "--member=2: expects one of the run's members, 0 to 1"),
     (f"{RUN} --seed=3 --member=1", "--seed=3: member 1 has seed 5"),
+    (f"{RUN} --policy=first", "--policy: expects one of last, best, not 'first'"),
+    (f"{RUN} --policy=best", f"{RUN}: expects a run with policy_best/, which is saved with each checkpoint"),
     (f"{RUN} --episodes=0", "--episodes: expects a whole number from 1 to 1000, not '0'"),
     (f"{RUN} --steps=many", "--steps: expects a whole number from 1"),
     (f"{RUN} --physics=mujco", "--physics=mujco: expects one of mjx, mujoco, warp"),

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 
+import numpy as np
 import probe_envs
 import pytest
 from made_runs import add_policies, write_run
@@ -11,6 +12,7 @@ from made_runs import add_policies, write_run
 from experiments.commandline.arguments import UsageError
 from experiments.playing import policies
 from sqt_jax import envs
+from sqt_jax.policy import load_policy
 
 NAN = math.nan
 
@@ -60,7 +62,7 @@ def test_members_that_the_run_does_not_have(run, asked, says):
 
 def test_the_caption(run):
     described = policies.read(run)
-    chosen = policies.choose(described, policies.final_returns(run, 4))
+    chosen = policies.choose(described, policies.member_returns(run, 4))
     says = "td3_sqt on hopper: member 1, seed 5, penalty_coef 0.1 (the best of 4 at the last evaluation)"
     assert policies.caption(described, chosen) == says
 
@@ -79,9 +81,60 @@ def test_the_caption(run):
 def test_returns_of_a_summary_that_may_be_damaged(tmp_path, content, returns):
     if content is not None:
         (tmp_path / "summary.json").write_text(json.dumps(content))
-    found = policies.final_returns(tmp_path, 2)
+    found = policies.member_returns(tmp_path, 2)
     assert [math.isnan(value) for value in found] == [math.isnan(value) for value in returns]
     assert [value for value in found if value == value] == [value for value in returns if value == value]
+
+
+def test_returns_of_a_run_that_was_killed_are_those_of_its_table(tmp_path):
+    path = write_run(tmp_path, curves=[[1, 7, 5], [2, 3, NAN], [4, 3, 6]])
+    assert policies.member_returns(path, 3)[::2] == [5, 6] and math.isnan(policies.member_returns(path, 3)[1])
+    assert policies.member_returns(path, 3, best=True) == [7, 3, 6]
+    with (path / "evaluations.csv").open("a") as file:
+        file.write("0,150,1")  # killed within a row
+    assert policies.member_returns(path, 3, best=True)[1:] == [3, 6]
+
+
+def killed(run, path):
+    """A copy of the run as it is before training ends: its policies are in checkpoints, the best ones too."""
+    shutil.copytree(run, path)
+    for step in (40, 50_000):
+        for kind in ("policy", "policy_best"):
+            shutil.copytree(run / "policy", path / "checkpoint" / f"step_{step:010}" / kind)
+    for folder in path.glob("checkpoint/*/policy_best"):
+        best = [{"return_mean": 4321.5, "env_steps": 30_000}, *[None] * 3]
+        (folder / "best.json").write_text(json.dumps(best))
+    shutil.rmtree(path / "policy")
+    return path
+
+
+def test_a_run_that_was_killed_plays_its_newest_checkpoint(run, tmp_path, monkeypatch):
+    path, env, described = killed(run, tmp_path / "run"), envs.make("hopper", "mujoco"), policies.read(run)
+    first, second = (policies.choose(described, [NAN] * 4, number=number) for number in (0, 1))
+    loaded = policies.load(path, first, env)
+    assert loaded.origin == "the last one, from the checkpoint at step 50,000"
+    np.testing.assert_array_equal(loaded.policy([[0.5] * 11]), policies.load(run, first, env).policy([[0.5] * 11]))
+    assert policies.load(path, first, env, best=True).origin == (
+        "the best evaluated one, of step 30,000 with return 4,321.5 (the best of many evaluations: new starts usually "
+        "return less), from the checkpoint at step 50,000"
+    )
+    origin = policies.load(path, second, env, best=True).origin
+    assert origin == "the initial one (the member has no evaluation), from the checkpoint at step 50,000"
+
+    def removed(folder, member):
+        """Training removes the checkpoint when some of its files have been read."""
+        policy = load_policy(folder, member)
+        shutil.rmtree(path / "checkpoint" / "step_0000050000", ignore_errors=True)
+        return policy
+
+    monkeypatch.setattr(policies, "load_policy", removed)
+    assert policies.load(path, first, env).origin == "the last one, from the checkpoint at step 40"
+
+
+def test_a_run_of_an_earlier_version_has_no_best_policies(run):
+    chosen = policies.choose(policies.read(run), [NAN] * 4, number=0)
+    with pytest.raises(UsageError, match=r"expects a run with policy_best/, .*; it has none$"):
+        policies.load(run, chosen, envs.make("hopper", "mujoco"), best=True)
 
 
 def test_the_policy_of_the_member_is_loaded(run):
@@ -89,8 +142,9 @@ def test_the_policy_of_the_member_is_loaded(run):
     described = policies.read(run)
     actions = []
     for number in (0, 1):
-        policy = policies.load(run, policies.choose(described, [NAN] * 4, number=number), env)
-        actions.append(policy([[0.5] * 11]))
+        loaded = policies.load(run, policies.choose(described, [NAN] * 4, number=number), env)
+        assert loaded.origin == "the last one"
+        actions.append(loaded.policy([[0.5] * 11]))
     assert actions[0].shape == (1, 3) and not (actions[0] == actions[1]).any()
 
 
@@ -114,7 +168,10 @@ def other_sizes(path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (no_policy, "expects a run with a policy, which is saved when training ends; it has none yet"),
+        (
+            no_policy,
+            "expects a run with policy/, which is saved with each checkpoint and when training ends; it has none",
+        ),
         (no_member, "member_1.npz: there is no such file"),
         (damaged, "member_1.npz: not the parameters of a policy"),
         (other_sizes, "policy: is not a policy for hopper: its sizes are 2 and 1"),
@@ -124,7 +181,7 @@ def test_a_policy_that_cannot_be_played_is_rejected_in_one_line(run, tmp_path, c
     path = tmp_path / "run"
     shutil.copytree(run, path)
     change(path)
-    chosen = policies.choose(policies.read(path), policies.final_returns(path, 4))
+    chosen = policies.choose(policies.read(path), policies.member_returns(path, 4))
     with pytest.raises(UsageError) as error:
         policies.load(path, chosen, envs.make("hopper", "mujoco"))
     assert says in str(error.value) and str(error.value).startswith(str(path)) and str(error.value).isprintable()

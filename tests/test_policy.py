@@ -81,6 +81,43 @@ def test_a_missing_member_is_named(tmp_path):
         policy.load_policy(tmp_path / "policy", member=7)
 
 
+def test_the_folder_of_a_run_has_the_policies_of_its_newest_checkpoint(td3_policy, tmp_path):
+    for name in ("policy", "policy_best"):
+        shutil.copytree(td3_policy, tmp_path / "checkpoint" / "step_0000000060" / name)
+    (tmp_path / "config.json").write_text("{}")  # the run's own
+    obs, expected = jnp.ones((1, 2)), policy.load_policy(td3_policy, 1)(jnp.ones((1, 2)))
+    (tmp_path / "checkpoint" / "step_0000000080" / "policy").mkdir(parents=True)  # being removed
+    for best in (False, True):
+        np.testing.assert_array_equal(policy.load_policy(tmp_path, 1, best)(obs), expected)
+    with pytest.raises(FileNotFoundError, match="config.json: there is no such file"):
+        shutil.rmtree(tmp_path / "checkpoint" / "step_0000000060")
+        policy.load_policy(tmp_path)
+    with pytest.raises(ValueError, match="^best: expects the folder of a run, not"):
+        policy.load_policy(td3_policy, best=True)
+
+
+def test_parameters_that_are_removed_just_now_are_missing(td3_policy, monkeypatch):
+    """Not damaged: another checkpoint is read then."""
+
+    def removed(path):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(zipfile, "ZipFile", removed)
+    with pytest.raises(FileNotFoundError, match="member_0.npz: there is no such file"):
+        policy.load_policy(td3_policy)
+
+
+def test_policies_that_were_written_are_read_bit_for_bit(td3_policy):
+    env, config = probe_envs.constant_reward(), experiment.make_config("td3", "cheetah", hidden=(8, 8))
+    arrays = policy.read_policies(td3_policy, config, env, 2)
+    for member in range(2):
+        with np.load(td3_policy / f"member_{member}.npz") as written:
+            assert {*arrays} == {*written} and len(arrays) == 6
+            assert all(arrays[name][member].tobytes() == written[name].tobytes() for name in written)
+    with pytest.raises(ValueError, match="does not have the parameters of td3 on cheetah"):
+        policy.read_policies(td3_policy, experiment.make_config("td3", "cheetah", hidden=(9, 8)), env, 2)
+
+
 # A hostile or damaged folder. `damage` gets the folder.
 
 

@@ -119,9 +119,10 @@ def test_a_finished_run_does_not_change(tmp_path, unbroken):
     before = content()
     assert resumed(tmp_path) == 0
     assert content() == before
-    shutil.rmtree(path_in(tmp_path) / "policy")  # as after a full disk
-    assert resumed(tmp_path) == 0
-    assert content().keys() >= before.keys()
+    for name in ("policy", "policy_best"):
+        shutil.rmtree(path_in(tmp_path) / name)  # as after a full disk
+        assert resumed(tmp_path) == 0
+        assert content().keys() >= before.keys()
 
 
 def test_a_finished_run_is_resumed_for_more_steps(tmp_path):
@@ -250,12 +251,13 @@ def test_a_resumed_run_has_no_summary_until_it_ends(tmp_path, monkeypatch):
     seen = []
 
     def looked_at(*arguments, **options):
-        seen.append((path_in(tmp_path) / "summary.json").exists())
+        names = ("summary.json", "policy", "policy_best")
+        seen.append([name for name in names if (path_in(tmp_path) / name).exists()])
         return loop.train_loop(*arguments, **options)
 
     monkeypatch.setattr(session, "train_loop", looked_at)
     assert resumed(tmp_path, "--steps=140", "--keep_checkpoints=3") == 0
-    assert seen == [False]
+    assert seen == [[]]  # until then the policies are the checkpoints'
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
 
 

@@ -95,9 +95,11 @@ def added(folder):
 
 
 def of_another_step(folder):
-    shutil.rmtree(folder / LAST / "state")
-    shutil.copytree(folder / BEFORE / "state", folder / LAST / "state")
-    manifest(state=lambda _: json.loads((folder / BEFORE / "manifest.json").read_text())["state"])(folder)
+    before = json.loads((folder / BEFORE / "manifest.json").read_text())
+    for name in ("state", "policy", "policy_best"):
+        shutil.rmtree(folder / LAST / name)
+        shutil.copytree(folder / BEFORE / name, folder / LAST / name)
+    manifest(files=lambda _: before["files"])(folder)
 
 
 UNREADABLE = "its manifest.json cannot be read"
@@ -118,12 +120,14 @@ DAMAGED = {
     "time not finite": (manifest(position=lambda old: old | {"wall_seconds": float("inf")}), UNREADABLE),
     "another step": (manifest(position=lambda old: old | {"env_steps": 40}), UNREADABLE),
     "negative length": (manifest(lengths=lambda _: {"evaluations": -1, "metrics": 0}), UNREADABLE),
-    "absurd size": (manifest(state=lambda old: dict.fromkeys(old, [10**15, 0])), "far larger"),
+    "absurd size": (manifest(files=lambda old: dict.fromkeys(old, [10**15, 0])), "far larger"),
     "state flipped": (in_state(flipped), "is damaged"),
     "state truncated": (in_state(truncated), "is damaged"),
     "state file missing": (in_state(Path.unlink), "files are missing"),
     "state with another file": (added, "files are missing, or there are others"),
     "state a link": (moved_out(f"{LAST}/state"), "files are missing"),
+    "policy flipped": (lambda folder: flipped(folder / LAST / "policy_best" / "best.json"), "is damaged"),
+    "policy a link": (moved_out(f"{LAST}/policy"), "files are missing"),
     "checkpoint a link": (moved_out(LAST), "it is a link"),
     "rows missing": (in_rows(Path.unlink), f"{ROWS} is missing"),
     "rows truncated": (in_rows(truncated), f"{ROWS} is damaged"),

@@ -405,6 +405,7 @@ def test_evaluation_plays_the_checkpoint(trained):
     obs = jnp.array([[0.3, -0.2]])
     state = trained.states[-1]
     act = jax.jit(jax.vmap(lambda policy: trained.agent.views.policy_action(policy, obs)[0, 0]))
+    assert same(trained.agent.views.policy(state), state.checkpoints.checkpoint)  # and it is the policy that is saved
     worth = np.asarray(act(state.checkpoints.checkpoint))
     returns = np.asarray(trained.sweep.evaluate(trained.final)[0].returns)
     np.testing.assert_allclose(returns, EPISODE * worth[:, None].repeat(2, axis=1), rtol=1e-5, atol=1e-6)

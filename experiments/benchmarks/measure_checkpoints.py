@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from experiments.benchmarks.measurements import Measurement, member_keys
 from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
+from experiments.running.run_policies import RunPolicies
 from sqt_jax import envs, experiment, train
 from sqt_jax.members import layout_here
 
@@ -23,21 +24,24 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     """A first checkpoint with all rows, a later one with the rows of one interval, and how long it blocks training."""
     config = experiment.make_config(algo, task, replay_capacity=FILLED)
     trainer = experiment.make_trainer(config)
-    replay = experiment.replay_of(config, envs.make(task))
+    env = envs.make(task)
+    replay, policies = experiment.replay_of(config, env), RunPolicies(config, env, members)
     layout = layout_here(members)
     sweep = train.make_sweep(trainer, layout)
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
+    policies.start(state.agent)
     everything, later, waits, size = [], [], [], 0
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
             store = CheckpointStore(Path(folder), replay, layout, 2, print)
-            save(store, state, FILLED - NEW)
-            waiting, complete = save(store, state, FILLED)
+            save(store, state, policies, FILLED - NEW)
+            waiting, complete = save(store, state, policies, FILLED)
             waits.append(waiting)
             later.append(complete)
         with tempfile.TemporaryDirectory() as folder:
-            everything.append(save(CheckpointStore(Path(folder), replay, layout, 2, print), state, FILLED)[1])
+            store = CheckpointStore(Path(folder), replay, layout, 2, print)
+            everything.append(save(store, state, policies, FILLED)[1])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
     def measured(what: str, seconds: list[float]) -> Measurement:
@@ -54,10 +58,10 @@ def bench_checkpoint(algo: str, task: str, members: int, repeats: int) -> Iterat
     yield measured(f"{NEW:,} new rows, until training continues", waits)
 
 
-def save(store: CheckpointStore, state: train.TrainState, at: int) -> tuple[float, float]:
+def save(store: CheckpointStore, state: train.TrainState, policies: RunPolicies, at: int) -> tuple[float, float]:
     """Saves a checkpoint after `at` steps: the seconds until training can continue, and until it is on disk."""
     began = time.perf_counter()
-    store.save(state, Position(at, at), {})
+    store.save(state, Position(at, at), {}, policies.writer(state.agent))
     waiting = time.perf_counter() - began
     store.wait()
     return waiting, time.perf_counter() - began

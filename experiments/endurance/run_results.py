@@ -8,10 +8,12 @@ import numpy as np
 import orbax.checkpoint
 
 from experiments.running import run_config
+from experiments.running.run_policies import read_evaluations
+from sqt_jax.policy_folders import BEST
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """All arrays of the last checkpoint, the replay rows, and both tables without their times, by name."""
+    """All arrays of the last checkpoint and of the policies, the replay rows, and both tables without their times."""
     folder = max((path / "checkpoint").glob("step_*"))
     run = run_config.read(path)
     results: dict[str, Any] = dict(orbax.checkpoint.PyTreeCheckpointer().restore((folder / "state").absolute()))
@@ -21,6 +23,10 @@ def read_results(path: Path) -> dict[str, Any]:
         rows.append(np.fromfile(file, np.float32).reshape(len(run.members), stop - start, -1))
     # Files of rows that are no longer in the replay may remain.
     results["rows"] = np.concatenate(rows, axis=1)[:, -run.content["replay_rows"] :]
+    for file in sorted(path.glob("policy*/member_*.npz")):
+        with np.load(file) as policy:
+            results |= {f"{file.parent.name}/{file.stem}/{name}": array for name, array in policy.items()}
+    results["best evaluations"] = list(read_evaluations(path / BEST).items())
     for name in ("evaluations", "metrics"):
         with (path / f"{name}.csv").open(newline="") as table:
             results[name] = [

@@ -23,6 +23,10 @@ LONG = 45  # cells with more characters may be wrapped
 NUMBER = re.compile(r"(?:P )?([+-]?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?)(?![^\s,%])")
 
 
+OF_WHICH_POLICY = (
+    "The final return is that of the last evaluation, whose policy experiments.play plays. The best return is a "
+    "maximum over all evaluations, hence optimistic; --policy=best plays its policy, if the run has kept it."
+)
 ALL_COMPLETE = "Every score covers all planned steps and seeds."
 
 
@@ -214,7 +218,7 @@ def _run(index: int, run: Details) -> Element:
         element("summary", f"Run {index}: {run.algo} on {run.env}, {run.status}", id=name),
         *part("Commands that repeat it", *(piece for command in run.commands for piece in _command(command))),
         *part("Overview", _pairs(pairs)),
-        *part("Members", table(columns, members)),
+        *part("Members", table(columns, members), element("p", OF_WHICH_POLICY, class_="caption")),
         *part(
             f"Settings that differ from {run.algo}'s defaults",
             table(["setting", "here", "default"], settings) if settings else none,

@@ -11,7 +11,7 @@ from experiments.evidence.groups import Group
 from experiments.evidence.pooling import Collected
 from experiments.evidence.published import PAPERS_TASKS
 from experiments.running import files
-from sqt_jax import envs
+from sqt_jax import envs, policy_folders
 
 MAX_POLICY_BYTES = 1_000_000
 COLUMNS = ("observation", "action", "episode_steps")
@@ -80,7 +80,7 @@ def _sizes_by_name(name: str) -> Mapping[str, Any]:
 
 
 def _sizes_by_runs(task: str, groups: Sequence[Group]) -> Mapping[str, Any] | None:
-    """The sizes in the first config.json or policy/config.json of the task's runs that has them; None without one."""
+    """The sizes in the first config.json, or config.json of a policy, of the task's runs that has them; else None."""
     kind = "own environment" if groups[0].own_env else "unknown here"
     for run, own_sizes in dict.fromkeys((member.run, member.own_sizes) for g in groups for member in g.members):
         sizes = own_sizes or _sizes_of_policy(run)
@@ -91,8 +91,11 @@ def _sizes_by_runs(task: str, groups: Sequence[Group]) -> Mapping[str, Any] | No
 
 
 def _sizes_of_policy(run: Path) -> tuple[int, int] | None:
+    def read(folder: Path) -> Any:
+        return files.read_json(folder / "config.json", MAX_POLICY_BYTES)
+
     try:
-        content = files.read_json(run / "policy" / "config.json", MAX_POLICY_BYTES)
+        content, _ = policy_folders.read_first(run, False, read)
         observation, action = content["observation_size"], content["action_size"]
     except (OSError, ValueError, TypeError, KeyError):
         return None

@@ -34,15 +34,17 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     """
     jax_settings.prepare()
     described = policies.read(run)
-    returns = policies.final_returns(run, len(described.members))
-    chosen = policies.choose(described, returns, options.seed, options.member)
+    best = options.policy == "best"
+    returns = policies.member_returns(run, len(described.members), best)
+    at = "by its best evaluation" if best else "at the last evaluation"
+    chosen = policies.choose(described, returns, options.seed, options.member, at)
     task = make_played_task(chosen.member.config, options.physics, options.camera)
-    policy = policies.load(run, chosen, task.env)
+    loaded = policies.load(run, chosen, task.env, best)
     caption = policies.caption(described, chosen)
     print(caption)
-    print(f"physics {task.physics}, start seed {options.start_seed}", flush=True)
+    print(f"physics {task.physics}, start seed {options.start_seed}, policy: {loaded.origin}", flush=True)
     console = consoles.console(stderr=True)
-    played = play_episodes(task, policy, options, console)
+    played = play_episodes(task, loaded.policy, options, console)
     for number, episode in enumerate(played):
         length = f"{episode.length:,} steps, {episode.length * task.period:.1f} s"
         print(f"episode {number}: return {episode.total:,.1f}, {length}, {episodes.ending(episode)}", flush=True)

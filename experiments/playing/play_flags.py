@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from experiments.commandline import arguments
-from experiments.commandline.arguments import Parser, UsageError, between
+from experiments.commandline.arguments import Parser, UsageError, between, one_of
 from experiments.playing import graphics
 from experiments.playing.film_formats import format_of
 from experiments.running import files
@@ -14,8 +14,9 @@ EXAMPLE = "python -m experiments.play RUN --video=film.mp4"
 DESCRIPTION = """\
 Plays the policy of a run: prints the return of each episode, and films the same episodes in real time.
 Without --video they are shown in MuJoCo's viewer if there is a display. Of a run's members, the best at the last
-evaluation is played, unless --seed or --member names another. Without a display, MUJOCO_GL selects OpenGL's
-implementation; by default EGL or OSMesa, whichever works."""
+evaluation is played, unless --seed or --member names another. Before training has ended, the policy is that of the
+newest checkpoint. Without a display, MUJOCO_GL selects OpenGL's implementation; by default EGL or OSMesa, whichever
+works."""
 MAX_SEED = 2**32 - 1
 MAX_CONFIG_BYTES = 10_000_000
 BRAX = "brax:"  # `brax_envs.PREFIX`, whose module imports JAX
@@ -27,6 +28,8 @@ def parser() -> Parser:
     add = made.add_argument
     add("--seed", type=between(0, MAX_SEED), metavar="N", help="play the member with this seed (the best of several)")
     add("--member", type=between(0, 1_000_000), metavar="N", help="play the member with this number, from 0")
+    choices = "last, or best: that of the member's best evaluation (last)"
+    add("--policy", type=one_of("last", "best"), default="last", metavar="WHICH", help=choices)
     add("--episodes", type=between(1, 1000), default=1, metavar="N", help="number of episodes (1)")
     add("--steps", type=between(1, 1_000_000), metavar="N", help="maximum steps of an episode (the task's time limit)")
     add("--start_seed", type=between(0, MAX_SEED), default=0, metavar="N", help="seed of the initial states (0)")
@@ -71,7 +74,7 @@ def check(run: Path, options: argparse.Namespace) -> None:
     if _setting(run, "physics") == "own":  # `sqt_jax.experiment.OWN_PHYSICS`, without importing JAX
         raise UsageError(
             f"{run}: expects a run on one of the library's environments; this one's was handed in from Python: there, "
-            f"use sqt_jax.load_policy({str(run / 'policy')!r}) and sqt_jax.evaluate_policy(policy, env)"
+            f"use sqt_jax.load_policy({str(run)!r}) and sqt_jax.evaluate_policy(policy, env)"
         )
     if options.video is None:
         for flag, given in {"--size": options.size, "--overwrite": options.overwrite}.items():

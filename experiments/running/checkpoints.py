@@ -2,7 +2,7 @@
 
 A checkpoint's folder gets its name when it is complete: a process that dies leaves a valid checkpoint or none. Replay
 rows never change, so each checkpoint writes only the rows since the last one, from the device in pieces. Orbax writes
-the other arrays.
+the other arrays, and the caller further files.
 """
 
 import shutil
@@ -29,11 +29,12 @@ PIECE_BYTES = 64_000_000  # of replay rows on the host at a time
 
 
 class Restored(NamedTuple):
-    """A checkpoint that was read: the arguments of its `CheckpointStore.save`."""
+    """A checkpoint that was read: the arguments of its `CheckpointStore.save`, and its folder."""
 
     state: TrainState
     position: Position
     lengths: dict[str, int]
+    folder: Path  # with the further files that were saved in it
 
 
 class CheckpointStore:
@@ -68,11 +69,18 @@ class CheckpointStore:
         self._with_rows = jax.jit(with_rows, donate_argnums=0)
         self._row_width = jax.eval_shape(lambda: replay.rows(replay.init(), 0, 1)).shape[1]
 
-    def save(self, state: TrainState, position: Position, lengths: dict[str, int]) -> None:
+    def save(
+        self,
+        state: TrainState,
+        position: Position,
+        lengths: dict[str, int],
+        write_more: Callable[[Path], None] = lambda folder: None,
+    ) -> None:
         """Writes the rows, copies the other arrays to the host, and writes these in a thread (`wait`).
 
         Args:
           lengths: bytes of each of the run's tables at this state.
+          write_more: called in the thread with the checkpoint's folder: writes further files into it.
         """
         self.wait()
         same = [step for step in self._steps if step.env_steps == position.env_steps]
@@ -87,9 +95,13 @@ class CheckpointStore:
         rest = self._without_rows(state)
         own = by_path(every_leaf(member_axes(self.replay), rest))
         arrays = {name: self._host_copy(leaf, name in own) for name, leaf in _non_empty(rest).items()}
-        arguments = (Step(position.env_steps, len(same)), arrays, position, lengths)
-        self._writer = threading.Thread(target=self._write, args=arguments, daemon=True)
-        self._writer.start()
+        arguments = (Step(position.env_steps, len(same)), arrays, position, lengths, write_more)
+        writer = threading.Thread(target=self._write, args=arguments, daemon=True)
+        try:
+            writer.start()
+            self._writer = writer
+        except RuntimeError:  # the system allows no more threads
+            self._write(*arguments)
 
     def wait(self) -> None:
         """Returns when the checkpoint that is being written is on disk, or has failed."""
@@ -126,7 +138,8 @@ class CheckpointStore:
         state = self._read(latest, manifest, template)
         self._steps = {step: valid[step].position.evaluated for step in sorted(valid)}
         self._rows, self._rows_end = sorted({file for each in valid.values() for file in each.rows}), latest.env_steps
-        return Restored(state, manifest.position, manifest.lengths)
+        folder = self.path / latest.name
+        return Restored(state=state, position=manifest.position, lengths=manifest.lengths, folder=folder)
 
     def remove_others(self) -> None:
         """Removes checkpoint files that belong to none of the checkpoints to keep."""
@@ -156,21 +169,29 @@ class CheckpointStore:
             self._rows.append(file)
             start = self._rows_end = start + count
 
-    def _write(self, step: Step, arrays: dict[str, np.ndarray], position: Position, lengths: dict[str, int]) -> None:
+    def _write(
+        self,
+        step: Step,
+        arrays: dict[str, np.ndarray],
+        position: Position,
+        lengths: dict[str, int],
+        write_more: Callable[[Path], None],
+    ) -> None:
         capacity = self.replay.capacity
         part = self.path / f"{step.name}.part"
         try:
             _remove(part)
             _orbax().save(part.absolute() / "state", arrays)
-            written = files.below(part / "state")
-            state = {name: (path.stat().st_size, files.crc(path)) for name, path in written.items()}
+            write_more(part)
+            written = manifests.files_of(part)
+            listed = {name: (path.stat().st_size, files.crc(path)) for name, path in written.items()}
             rows = rows_needed(self._rows, step.env_steps, capacity)
-            manifest = Manifest(state=state, rows=rows, position=position, lengths=lengths)
-            manifests.write(part / "manifest.json", manifest)
-            for folder in {path.parent for path in written.values()} | {part}:
-                files.sync_folder(folder)
+            manifest = Manifest(files=listed, rows=rows, position=position, lengths=lengths)
+            manifests.write(part / manifests.MANIFEST, manifest)
+            for path in {*written.values(), *(path.parent for path in written.values()), part}:
+                files.sync(path)
             part.rename(self.path / step.name)
-            files.sync_folder(self.path)
+            files.sync(self.path)
         except Exception as error:  # Orbax raises many types, and none may end the training
             shutil.rmtree(part, ignore_errors=True)
             self._warn_of_failure(step.env_steps, error)

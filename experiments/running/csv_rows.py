@@ -71,7 +71,7 @@ class CsvTable:
         """
         if not self.flush():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), self._name)
-        files.sync(self._file)
+        files.sync_open(self._file)
         return self._size
 
     def close(self) -> None:

@@ -81,14 +81,14 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         with part.open("xb") as file:
             yield file
             file.flush()
-            sync(file.fileno())
+            sync_open(file.fileno())
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
 
 
-def sync(descriptor: int) -> None:
+def sync_open(descriptor: int) -> None:
     """Returns when an open file is on disk, or at once where the file system cannot say. Raises `OSError`."""
     try:
         os.fsync(descriptor)
@@ -97,11 +97,11 @@ def sync(descriptor: int) -> None:
             raise
 
 
-def sync_folder(folder: Path) -> None:
-    """Returns when the folder's list of names is on disk, as `sync`."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync(path: Path) -> None:
+    """Returns when a file's content, or a folder's list of names, is on disk, as `sync_open`."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        sync(descriptor)
+        sync_open(descriptor)
     finally:
         os.close(descriptor)
 

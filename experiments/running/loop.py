@@ -1,7 +1,7 @@
 """The host loop: compiled training in chunks, with evaluations, checkpoints and reports in between.
 
-The loop writes no files. The compiled sweep, the display, and the functions that write reports, write checkpoints and
-ask whether to stop are its arguments.
+The loop writes no files. The compiled sweep, the display, and the functions that write reports, keep the best policies,
+write checkpoints and ask whether to stop are its arguments.
 """
 
 import time
@@ -114,6 +114,7 @@ def train_loop(
     start: Position = START,
     checkpoint_every: int = 0,
     save: Callable[[TrainState, Position], None] = lambda state, position: None,
+    evaluated_at: Callable[[TrainState, int, np.ndarray], None] = lambda state, env_steps, returns: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Outcome:
     """Trains to `train.steps`, with evaluations at step 0, every `eval_every` steps and the end.
@@ -124,6 +125,8 @@ def train_loop(
       stop: asked between chunks. Once it returns True, the state is saved and the loop returns.
       checkpoint_every: environment steps between calls of `save`, which is also called at the end; 0: never.
       save: called after the report of an evaluation at the same step.
+      evaluated_at: called after each evaluation with the state, its env steps, and the members' returns [S, episodes],
+        which are NaN for members that have diverged.
     """
     began = clock() - start.wall_seconds
     pace = Pace()
@@ -159,6 +162,7 @@ def train_loop(
         returns = np.where(bad[:, None], np.nan, returns)
         if not bad.all():
             last_return = float(np.nanmean(returns))
+        evaluated_at(state, done, returns)
         send(returns, lengths, {name: np.where(bad, np.nan, of_members(value)) for name, value in bias.items()})
         evaluated = done
         display.evaluated(done, returns[~bad], lengths[~bad], speeds[~bad])

@@ -2,6 +2,7 @@
 
 rows_0000000000_0000005000.bin   replay rows of these env steps of every member, float32 [S, rows, W]; written once
 step_0000005000/state/           every other array of the training state, written by Orbax
+step_0000005000/policy/          the members' policies; policy_best/: those of their best evaluations (`run_policies`)
 step_0000005000/manifest.json    the checkpoint's files with sizes and CRCs, and the lengths of the run's tables
 step_0000005000.1/               a second checkpoint of the same step, after its evaluation
 
@@ -16,10 +17,11 @@ from typing import Any, NamedTuple
 
 from experiments.running import files
 from experiments.running.loop import Position
+from sqt_jax.policy_folders import CHECKPOINT as STEP
 
-FORMAT = 4  # increased when the training state, its files or the tables' columns change
+FORMAT = 5  # increased when the training state, its files or the tables' columns change
 MAX_BYTES = 10_000_000
-STEP = re.compile(r"step_(\d{10})(?:\.(\d))?")
+MANIFEST = "manifest.json"
 ROWS = re.compile(r"rows_(\d{10})_(\d{10})\.bin")
 
 
@@ -59,7 +61,7 @@ class Rows(NamedTuple):
 class Manifest(NamedTuple):
     """The content of a checkpoint's manifest.json."""
 
-    state: dict[str, tuple[int, int]]  # size and CRC of each file below state/
+    files: dict[str, tuple[int, int]]  # size and CRC of each file below its folder, without the manifest's own
     rows: list[Rows]
     position: Position
     lengths: dict[str, int]  # of the run's tables
@@ -76,6 +78,11 @@ def is_checkpoint_file(name: str) -> bool:
     return re.fullmatch(rf"({STEP.pattern}|{ROWS.pattern})(\.part)?", name) is not None
 
 
+def files_of(checkpoint: Path) -> dict[str, Path]:
+    """The files that a manifest lists: all below a checkpoint's folder by their path in it, except the manifest."""
+    return {name: path for name, path in files.below(checkpoint).items() if name != MANIFEST}
+
+
 def rows_needed(rows: list[Rows], env_steps: int, capacity: int) -> list[Rows]:
     """The files with rows that a replay of `capacity` holds at `env_steps` or later."""
     return [file for file in rows if file.stop > env_steps - min(env_steps, capacity)]
@@ -83,7 +90,7 @@ def rows_needed(rows: list[Rows], env_steps: int, capacity: int) -> list[Rows]:
 
 def write(path: Path, manifest: Manifest) -> None:
     """Writes a manifest, completely or not at all. Raises `OSError`."""
-    content: dict[str, Any] = {"format": FORMAT, "state": manifest.state, "rows": [file.name for file in manifest.rows]}
+    content: dict[str, Any] = {"format": FORMAT, "files": manifest.files, "rows": [file.name for file in manifest.rows]}
     content |= {"crc": [file.crc for file in manifest.rows], "position": manifest.position._asdict()}
     content |= {"lengths": manifest.lengths}
     content |= {"own_crc": own_crc(content)}
@@ -102,7 +109,7 @@ def read(folder: Path, step: Step) -> Manifest:
     if path.is_symlink():
         raise DamagedCheckpoint("it is a link")
     try:
-        content = files.read_json(path / "manifest.json", MAX_BYTES)
+        content = files.read_json(path / MANIFEST, MAX_BYTES)
         if content["format"] != FORMAT:
             raise CannotResume(f"its checkpoints are of format {str(content['format'])[:20]!r}, not {FORMAT}")
         if content.pop("own_crc") != own_crc(content):
@@ -114,9 +121,9 @@ def read(folder: Path, step: Step) -> Manifest:
         lengths = {str(name): int(length) for name, length in content["lengths"].items()}
         if min(lengths.values(), default=0) < 0:
             raise ValueError
-        state = {str(name): (int(size), int(crc)) for name, (size, crc) in content["state"].items()}
+        listed = {str(name): (int(size), int(crc)) for name, (size, crc) in content["files"].items()}
         position = _position(content["position"], step.env_steps)
-        return Manifest(state=state, rows=rows, position=position, lengths=lengths)
+        return Manifest(files=listed, rows=rows, position=position, lengths=lengths)
     except (FileNotFoundError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise DamagedCheckpoint(f"its manifest.json cannot be read ({type(error).__name__})") from None
     except OSError as error:
@@ -134,12 +141,13 @@ def verify(folder: Path, step: Step, manifest: Manifest, capacity: int, state_by
       DamagedCheckpoint: a file is damaged or missing.
       CannotResume: a file exists and cannot be read.
     """
-    found = files.below(folder / step.name / "state")
-    if manifest.state.keys() != found.keys():
+    found = files_of(folder / step.name)
+    if manifest.files.keys() != found.keys():
         raise DamagedCheckpoint("files are missing, or there are others")
-    if sum(size for size, _ in manifest.state.values()) > 2 * state_bytes + 10_000_000:
+    # Each of the two folders of policies holds a part of the state again.
+    if sum(size for size, _ in manifest.files.values()) > 4 * state_bytes + 10_000_000:
         raise DamagedCheckpoint("its files are far larger than the state they hold")
-    for name, (size, crc) in manifest.state.items():
+    for name, (size, crc) in manifest.files.items():
         _check(found[name], name, size, crc)
     reached = step.env_steps - min(step.env_steps, capacity)
     if manifest.rows and manifest.rows[0].start <= reached:

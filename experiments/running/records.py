@@ -50,7 +50,7 @@ RUN_FILES = (
     "summary.json.part",
     "curves.png",
 )
-RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "tensorboard")
+RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "policy_best", "policy_best.part", "tensorboard")
 # Left by a run that died before it wrote its config.json.
 LEFTOVERS = {"lock", "config.json.part"}
 

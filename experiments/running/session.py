@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from experiments.commandline.arguments import (
     DIVERGED,
@@ -27,10 +28,11 @@ from experiments.running.loop import START, Outcome, Position, train_loop
 from experiments.running.plan import Plan, make_plan, name_taken, not_only_a_run
 from experiments.running.progress import Display
 from experiments.running.run_config import Member
+from experiments.running.run_policies import RunPolicies
 from experiments.running.signals import stop_on_signal
 from experiments.surroundings.consoles import console
 from sqt_jax.experiment import make_trainer, replay_of
-from sqt_jax.policy import save_policy
+from sqt_jax.policy_folders import BEST, LAST
 from sqt_jax.train import TrainState, make_sweep
 from sqt_jax.types import Array, Environment, Scalars
 
@@ -74,6 +76,7 @@ class Session:
             plan.output["keep_checkpoints"],
             self.display.message,
         )
+        self.policies = RunPolicies(plan.config, plan.env, len(plan.members))
         self.restored: Restored | None = None  # the checkpoint that training resumes from
 
     def run(self) -> int:
@@ -101,7 +104,9 @@ class Session:
                 self._record_resumption(self.plan.resumed)
                 self.store.remove_others()
             resumed_at = self.restored.position.env_steps if self.restored else None
-            self.announcer.start(resumed_at, self.store.sizes(self.template))
+            state_bytes, row_bytes = self.store.sizes(self.template)
+            state_bytes += self.policies.bytes_in_checkpoint(self.template.agent)
+            self.announcer.start(resumed_at, (state_bytes, row_bytes))
             try:
                 outcome = self._train(tables, lambda: bool(received))
             except (MemoryError, jax.errors.JaxRuntimeError) as error:
@@ -139,6 +144,8 @@ class Session:
         assert self.plan.resumed
         try:
             restored = self.store.restore(self.template)
+            if restored:
+                self.policies.restore(restored.folder)
         except manifests.CannotResume as error:
             raise UsageError(f"--resume={self.plan.path}: {resume.EXPECTS_CHECKPOINTS}; {error}") from None
         if restored is None:
@@ -147,7 +154,7 @@ class Session:
 
     def _is_finished(self, at: Position) -> bool:
         """Whether all steps, evaluations and results exist: then summary.json is not written again."""
-        results = self._summary.exists() and (self.plan.path / "policy").is_dir()
+        results = self._summary.exists() and all((self.plan.path / name).is_dir() for name in (LAST, BEST))
         return at.env_steps == at.evaluated == self.plan.train.steps and results
 
     @property
@@ -178,7 +185,10 @@ class Session:
             raise _cannot_write(self.plan, error) from None
 
     def _record_resumption(self, run: run_config.RunConfig) -> None:
-        """Adds this process to config.json, and removes summary.json, which says that the run has ended."""
+        """Adds this process to config.json. Removes summary.json, which says that the run has ended, and its policies.
+
+        Until it ends again, its policies are those of its checkpoints.
+        """
         plan = self.plan
         at = self.restored.position.env_steps if self.restored else 0
         try:
@@ -187,6 +197,8 @@ class Session:
             )
             run_config.write(plan.path, content)
             self._summary.unlink(missing_ok=True)
+            for name in (LAST, BEST):
+                shutil.rmtree(plan.path / name, ignore_errors=True)
         except OSError as error:
             raise _cannot_write(self.plan, error) from None
 
@@ -221,11 +233,19 @@ class Session:
                     f"no checkpoint at step {position.env_steps:,} ({error.strerror}); training continues"
                 )
                 return
-            self.store.save(state, position, lengths)
+            self.store.save(state, position, lengths, self.policies.writer(state.agent))
 
+        def evaluated_at(state: TrainState, env_steps: int, returns: np.ndarray) -> None:
+            self.policies.evaluated(state.agent, env_steps, returns)
+
+        if self.restored:
+            first = self.restored.state
+        else:
+            first = self.sweep.init(*self.init_arguments)
+            self.policies.start(first.agent)
         outcome = train_loop(
             self.sweep,
-            self.restored.state if self.restored else self.sweep.init(*self.init_arguments),
+            first,
             self.plan.train,
             len(self.plan.members),
             report=tables.report,
@@ -234,6 +254,7 @@ class Session:
             start=self.restored.position if self.restored else START,
             checkpoint_every=self.plan.output["checkpoint_every"],
             save=save,
+            evaluated_at=evaluated_at,
         )
         self.store.wait()
         return outcome
@@ -241,11 +262,7 @@ class Session:
     def _write_results(self, outcome: Outcome) -> bool:
         """Writes the policies and, if there are evaluations, curves.png; returns whether there are."""
         plan = self.plan
-        policy, part = plan.path / "policy", plan.path / "policy.part"
-        shutil.rmtree(part, ignore_errors=True)
-        save_policy(part, plan.config, plan.env, outcome.state.agent, len(plan.members))
-        shutil.rmtree(policy, ignore_errors=True)  # of an earlier process
-        part.rename(policy)
+        self.policies.write_results(plan.path, outcome.state.agent)
         table = records.read_evaluations(plan.path / "evaluations.csv")
         if not len(table["member"]):
             return False
