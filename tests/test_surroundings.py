@@ -134,8 +134,8 @@ ROWS = [
     Row("stand-in: memory of an outer control group", LARGE, "under memory.max of the control group job_7", 2,
         python=V2_NESTED),  # fmt: skip
     Row("stand-in: memory of a control group, version 1", LARGE, "under memory.limit_in_bytes", 2, python=V1),
-    Row("ulimit -v", f"ulimit -v 12000000; {LARGE}00", "under ulimit -v", 2),
-    Row("ulimit -d", f"ulimit -d 12000000; {LARGE}00", "under ulimit -d", 2),
+    Row("ulimit -v", f"ulimit -v 9000000; {LARGE}00", "under ulimit -v", 2),
+    Row("ulimit -d", f"ulimit -d 9000000; {LARGE}00", "under ulimit -d", 2),
     Row("stdout is full", "tables > /dev/full", "could not be written: No space left", 1),
     Row("stderr is full", "run --stepz=1 2> /dev/full", "", 2),
     Row("stdout is closed", "tables >&-", "", 0),
