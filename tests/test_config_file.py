@@ -21,6 +21,29 @@ def test_lines_are_arguments(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("line", "argument"),
+    [
+        ("name: no", "--name=no"),
+        ("name: 'no'", "--name=no"),
+        ("name: Off", "--name=Off"),
+        ("name: 2025-01-02", "--name=2025-01-02"),
+        ("name: 0123", "--name=0123"),
+        ("name: 12:30:45", "--name=12:30:45"),
+        ("name: null", "--name=null"),
+        ("lr: 3.0e-4", "--lr=3.0e-4"),
+        ("steps: 1_000", "--steps=1_000"),
+        ("quiet: yes", "--quiet=true"),
+        ("quiet: OFF", "--quiet=false"),
+        ("quiet: true", "--quiet=true"),
+    ],
+)
+def test_words_are_as_written(tmp_path, line, argument):
+    path = tmp_path / "flags.yaml"
+    path.write_text(line)
+    assert config_file.arguments(path, switches={"quiet"}) == [argument]
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("steps: 1\nsteps: 2", "expects each setting once, not steps 2 times"),

@@ -2,6 +2,8 @@
 
 import signal
 
+import pytest
+
 from experiments.running import signals
 
 
@@ -32,3 +34,25 @@ def test_the_handlers_are_the_old_ones_afterwards():
     with signals.stop_on_signal():
         assert [signal.getsignal(number) for number in signals.SIGNALS] != before
     assert [signal.getsignal(number) for number in signals.SIGNALS] == before
+
+
+@pytest.mark.parametrize("number", signals.ANNOUNCEMENTS)
+def test_an_announced_end_stops_a_run_and_may_be_repeated(monkeypatch, number):
+    """A batch system announces the end, then sends SIGTERM: the run is still saving."""
+    codes = []
+    monkeypatch.setattr(signals.os, "_exit", codes.append)
+    with signals.stop_on_signal() as received:
+        for sent in (number, number, signal.SIGTERM):
+            signal.raise_signal(sent)
+        assert received == [number, number, signal.SIGTERM] and codes == []
+
+
+def test_an_ignored_signal_stays_ignored():
+    """By `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals.stop_on_signal() as received:
+            signal.raise_signal(signal.SIGHUP)
+        assert received == [] and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
