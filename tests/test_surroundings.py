@@ -6,6 +6,7 @@ the system (`PYTHON`: code that runs before the command's, as sitecustomize.py),
 """
 
 import csv
+import functools
 import json
 import os
 import subprocess
@@ -249,8 +250,8 @@ def check(row: Row, done: subprocess.CompletedProcess[str]) -> None:
     assert row.never not in text, text
 
 
-def table(folder: Path) -> list[dict[str, str]]:
-    with next((folder / "out" / "cheetah" / "td3").glob("*/evaluations.csv")).open() as file:
+def table(folder: Path, algo: str = "td3") -> list[dict[str, str]]:
+    with next((folder / "out" / "cheetah" / algo).glob("*/evaluations.csv")).open() as file:
         return [{name: value for name, value in row.items() if name != "wall_seconds"} for row in csv.DictReader(file)]
 
 
@@ -281,6 +282,50 @@ def test_a_run_is_not_lost(row, tmp_path, undisturbed):
         assert (path / "policy" / "member_0.npz").exists() and (path / "summary.json").exists()
         assert (path / "curves.png").exists() == ("figures" not in row.name)
         assert not {item.name for item in tmp_path.iterdir()} & {"~", "false"}
+
+
+SMALL_DISK = """
+mkdir disk && mount -t tmpfs -o size=4m none disk || exit 77
+trap "umount disk" EXIT
+head -c 4000k /dev/zero > disk/filler
+run $TINY --out=disk --name=a --checkpoint_every=100; [ $? = 1 ] || exit 5
+rm disk/filler && run --resume=disk/cheetah/$ALGO/a && cp -r disk $OUT
+"""
+HARDSHIPS = {
+    "limits": Row("limits", f"ulimit -v 16000000; ulimit -Sn 64; ulimit -f 100000; {TRAIN}", "done"),
+    "a full disk": Row("a full disk", SMALL_DISK, "the results cannot be written"),
+    "stopped": next(row for row in TRAINED if row.name == "stopped and continued"),
+    "clock": next(row for row in TRAINED if row.name == "stand-in: a clock that jumps"),
+}
+
+
+@pytest.fixture(scope="module")
+def undisturbed_sqt(tmp_path_factory):
+    """The evaluations of a run of an algorithm without any surrounding."""
+
+    @functools.cache
+    def run(algo: str) -> list[dict[str, str]]:
+        folder = tmp_path_factory.mktemp(algo)
+        check(Row("none", TRAIN, "done"), in_surroundings(of_algorithm(Row("none", TRAIN, "done"), algo), folder))
+        return table(folder, algo)
+
+    return run
+
+
+def of_algorithm(row: Row, algo: str) -> Row:
+    return row._replace(variables=row.variables | {"ALGO": algo, "TINY": TINY.replace("td3", algo)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hardship", HARDSHIPS)
+@pytest.mark.parametrize("algo", ["td3_sqt", "sac_sqt", "td7_sqt"])
+def test_sqt_trains_through(algo, hardship, tmp_path, undisturbed_sqt):
+    row = of_algorithm(HARDSHIPS[hardship], algo)
+    done = in_surroundings(row, tmp_path)
+    if done.returncode == 77:
+        pytest.skip("a small disk can be mounted by root only")
+    check(row, done)
+    assert table(tmp_path, algo) == undisturbed_sqt(algo)
 
 
 @pytest.mark.slow

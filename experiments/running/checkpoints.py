@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint
+from absl import logging
 
 from experiments.running import files, manifests
 from experiments.running.loop import Position
@@ -261,6 +262,7 @@ def _remove(path: Path) -> None:
 
 
 def _orbax() -> Any:
+    logging.set_verbosity(logging.FATAL)  # it prints the failures that it also raises, with their tracebacks
     return orbax.checkpoint.Checkpointer(orbax.checkpoint.StandardCheckpointHandler())
 
 
