@@ -93,7 +93,7 @@ class BiasSums(NamedTuple):
         Returns:
           By `NAMES`: value_bias: mean over the critics minus return; value_bias_min: minimum over the critics minus
           return; value_bias_normalised: value_bias divided by |mean return| (REDQ,
-          https://arxiv.org/abs/2101.05982).
+          https://arxiv.org/abs/2101.05982), NaN where that is 0 or the quotient overflows.
         """
         sums = Sums(
             *(
@@ -103,8 +103,9 @@ class BiasSums(NamedTuple):
         )
         returns, q_mean, q_min = (x / sums.states for x in (sums.returns, sums.q_mean, sums.q_min))
         bias = q_mean - returns
+        normalised = bias / jnp.abs(returns)
         return {
             "value_bias": bias,
             "value_bias_min": q_min - returns,
-            "value_bias_normalised": bias / jnp.abs(returns),
+            "value_bias_normalised": jnp.where(jnp.isfinite(normalised), normalised, jnp.nan),
         }

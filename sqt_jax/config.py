@@ -78,7 +78,7 @@ class AgentConfig:
         20, "episodes per assessment after the switch (max_eps_when_checkpointing)", low=1, features=("checkpoints",)
     )
     policy_checkpoint_reset_weight: float = setting(
-        0.9, "factor on the best minimum return at the switch (reset_weight)",
+        0.9, "factor on the best minimum return at the switch; a negative one gets harder to reach (reset_weight)",
         low=0, high=1, features=("checkpoints",), formerly="checkpoint_reset_weight",
     )  # fmt: skip
     # The released code's variants of TD3, SAC and TD7 (`agents.released`).

@@ -123,7 +123,8 @@ def evaluate_policy(
     Args:
       policy: obs [B, O] -> action [B, A] in [-1, 1]. With an `Environment` it is traced, so it has to be JAX code.
       env: an `Environment`, or a Gymnasium environment with a bounded box as its action space and episodes that end
-        (those of `gymnasium.make` have a time limit).
+        (those of `gymnasium.make` have a time limit). Its observations are flattened, its actions scaled, by
+        `envs.gym_spaces`.
       num_episodes: episodes to play.
       seed: of the starts; Gymnasium's episode k starts with `reset(seed=seed + k)`.
 
@@ -131,22 +132,38 @@ def evaluate_policy(
       Undiscounted returns [episodes] and lengths [episodes], in steps.
 
     Raises:
-      ValueError: the actions of a Gymnasium environment have no bounds.
+      ValueError: the policy's actions have another size than the environment's. With a Gymnasium environment also:
+        an action is NaN, or `envs.gym_spaces` rejects a space.
     """
     if isinstance(env, Environment):
-        result = jax.jit(lambda key: evaluate(env, policy, key, num_episodes))(jax.random.key(seed))
+        checked = _checked(policy, env.action_size)
+        result = jax.jit(lambda key: evaluate(env, checked, key, num_episodes))(jax.random.key(seed))
         return np.asarray(result.returns), np.asarray(result.lengths)
-    low, high = (getattr(env.action_space, side, np.inf) for side in ("low", "high"))
-    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
-        raise ValueError(f"expected an action space with bounds, got {env.action_space}")
+    from sqt_jax.envs import gym_spaces  # imports gymnasium, which environments in JAX do not need
+
+    observations, actions = gym_spaces.observations(env.observation_space), gym_spaces.actions(env.action_space)
+    checked = _checked(policy, actions.size)
     returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, int)
     for episode in range(num_episodes):
         obs, _ = env.reset(seed=seed + episode)
         over = False
         while not over:
-            action = np.clip(policy(np.asarray(obs, np.float32)[None])[0], -1, 1)
-            obs, reward, terminated, truncated, _ = env.step(low + (action + 1) / 2 * (high - low))
+            action = actions.scale(checked(observations.flatten(obs)[None])[0])
+            obs, reward, terminated, truncated, _ = env.step(action)
             returns[episode] += reward
             lengths[episode] += 1
             over = terminated or truncated
     return returns, lengths
+
+
+def _checked(policy: Callable[[Any], Any], action_size: int) -> Callable[[Any], Any]:
+    """The policy, with a ValueError if its actions for obs [B, O] are not [B, `action_size`]."""
+
+    def act(obs: Any) -> Any:
+        action = policy(obs)
+        if np.shape(action) != (len(obs), action_size):
+            expected = f"[{len(obs)}, {action_size}] for observations {list(obs.shape)}"
+            raise ValueError(f"policy: expects actions {expected}, not {list(np.shape(action))}")
+        return action
+
+    return act

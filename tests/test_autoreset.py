@@ -175,6 +175,85 @@ def test_numbers_beyond_mujocos_own_limit_are_diverged():
     assert beyond.terminated and beyond.final_obs == 0
 
 
+def unreliable(fault=jnp.nan):
+    """Starts x in [0, 1): above 0.5 the state is `fault`. obs = (x, state); an action above 0.5 ends the episode."""
+
+    def start(key):
+        x = jax.random.uniform(key)
+        state = jnp.where(x > 0.5, fault, x)
+        return state, jnp.stack([x, state])
+
+    def advance(state, action):
+        return state, jnp.stack([state, state]), jnp.ones(()), action[0] > 0.5
+
+    def place(qpos, qvel):
+        return qpos[0], jnp.concatenate([qpos, qvel])
+
+    env = make_environment("unreliable", 2, 1, LENGTH, start, advance, place)
+    return env._replace(step=jax.jit(env.step))
+
+
+def starts_of(seed, count):
+    """The first `count` starts x of `unreliable` from the key of this seed."""
+    key, found = jax.random.key(seed), []
+    for _ in range(count):
+        start_key, key = jax.random.split(key)
+        found.append(float(jax.random.uniform(start_key)))
+    return found
+
+
+STOP, RUN = jnp.ones(1), jnp.zeros(1)
+GOOD_BAD_BAD_GOOD_BAD, BAD_BAD_GOOD_BAD = 99, 0  # seeds of such starts
+
+
+@pytest.mark.parametrize("fault", [np.nan, np.inf, -2e10])
+def test_a_start_that_is_not_finite_is_replaced_by_the_last_one_that_was(fault):
+    a, *bad, b, also_bad = starts_of(GOOD_BAD_BAD_GOOD_BAD, 5)
+    assert max(a, b) <= 0.5 < min(*bad, also_bad)
+    timesteps = play([STOP] * 4, GOOD_BAD_BAD_GOOD_BAD, unreliable(fault))
+    for timestep, x in zip(timesteps, [a, a, a, b, b], strict=True):
+        assert timestep.obs.tolist() == [x, x] and timestep.state.task == x  # of one start
+
+
+def test_before_a_finite_start_the_numbers_that_are_not_finite_become_0():
+    env, starts = unreliable(), starts_of(BAD_BAD_GOOD_BAD, 4)
+    assert [x > 0.5 for x in starts] == [True, True, False, True]
+    first, *after = play([RUN] * 2 + [STOP], BAD_BAD_GOOD_BAD, env)
+    assert first.obs.tolist() == first.final_obs.tolist() == [starts[0], 0]
+    # The state is broken: the step ends the episode, and the second start is the first one again.
+    assert after[0].terminated and after[0].reward == 0 and after[0].obs.tolist() == [starts[0], 0]
+    assert after[1].terminated and after[1].obs.tolist() == [starts[2]] * 2
+    assert after[2].terminated and after[2].reward == 1 and after[2].obs.tolist() == [starts[2]] * 2
+    for timestep in (first, *after):
+        assert all(np.isfinite(x).all() for x in (timestep.obs, timestep.reward, timestep.final_obs))
+
+
+def test_a_placed_state_that_is_not_finite_is_observed_as_0():
+    placed = unreliable().set_physics(jnp.array([0.25]), jnp.array([jnp.nan]))
+    assert placed.obs.tolist() == [0.25, 0] and placed.state.unstable_starts == 1
+
+
+def test_starts_that_are_not_finite_are_counted_over_all_episodes():
+    env = unreliable()
+    counts = [
+        [int(env.status(timestep)[name]) for timestep in play([STOP] * 3 + [RUN], seed, env)]
+        for name in ("unstable_starts", "unstable_steps")
+        for seed in (GOOD_BAD_BAD_GOOD_BAD, BAD_BAD_GOOD_BAD)
+    ]
+    assert counts == [[0, 1, 2, 2, 2], [1, 2, 2, 3, 3], [0, 0, 0, 0, 0], [0, 1, 2, 2, 2]]
+
+
+def test_under_vmap_only_the_environment_with_a_bad_start_repeats_its_last_one():
+    seeds, env = jnp.array([GOOD_BAD_BAD_GOOD_BAD, BAD_BAD_GOOD_BAD]), unreliable()
+    together = jax.vmap(env.reset)(jax.vmap(jax.random.key)(seeds))
+    alone = [play([STOP] * 4, int(seed), env) for seed in seeds]
+    for step in range(1, 5):
+        together = jax.vmap(env.step)(together, jnp.ones((2, 1)))
+        for index in range(2):
+            for a, b in zip(leaves(together), leaves(alone[index][step]), strict=True):
+                np.testing.assert_array_equal(a[index], b)
+
+
 def test_under_vmap_only_the_environment_that_ended_restarts():
     timesteps = jax.vmap(ENV.reset)(jax.random.split(jax.random.key(0), 3))
     after = jax.vmap(ENV.step)(timesteps, jnp.stack([GO, END, GO]))

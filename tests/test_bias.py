@@ -51,6 +51,17 @@ def test_the_mean_and_the_minimum_of_the_critics_have_a_bias_each():
     np.testing.assert_allclose(found, [1.0, -1.0, 1.0 / mean_return], rtol=1e-5)
 
 
+@pytest.mark.parametrize(("scale", "normalised"), [(2.0, 5 / 2), (0.0, np.nan), (1.2e-38, np.nan)])
+def test_the_normalised_bias_is_not_measured_where_the_mean_return_is_0(scale, normalised):
+    """One state with Q = return + 5, of an episode whose only reward is `-scale`; 5 / 1.2e-38 is beyond float32."""
+    sums = BiasSums.start(1).add(
+        jnp.array([True]), 9, jnp.float32([-scale]), jnp.zeros(1), jnp.float32([[5 - scale]]), jnp.float32(0.5)
+    )
+    found = sums.result(jnp.array([True]))
+    np.testing.assert_allclose(found["value_bias"], 5, rtol=1e-6)
+    np.testing.assert_allclose(found["value_bias_normalised"], normalised, rtol=1e-6)
+
+
 def test_bonuses_count_from_the_next_action_on():
     # With a bonus of 2 per action, Q of the last state is its reward only, of the one before 1 + 0.5 (2 + 1), ...
     truth = jnp.array([1 + 0.5 * (2 + 1 + 0.5 * (2 + 1)), 1 + 0.5 * (2 + 1), 1.0])

@@ -1,11 +1,13 @@
 """Evaluation: each episode to its own end, from fresh starts, under the given policy."""
 
+import re
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
 from probe_envs import constant_reward, countdown, one_step
 
 from sqt_jax import envs, rollout
@@ -138,16 +140,16 @@ def test_a_policy_has_the_same_return_in_gymnasiums_environment_and_in_ours():
 class Ladder:
     """With Gymnasium's interface: the reward is the action that the environment gets, 3 steps, actions from 0 to 10."""
 
-    class action_space:
-        low, high = np.zeros(1, np.float32), np.full(1, 10, np.float32)
+    observation_space, action_space = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(0, 10, (1,))
 
     def reset(self, seed):
         self.steps = 0
         return np.array([float(seed)]), {}
 
     def step(self, action):
+        assert self.action_space.contains(action)
         self.steps += 1
-        return np.zeros(1), float(action[0]), False, self.steps == 3, {}
+        return np.zeros(1), float(action.ravel()[0]), False, self.steps == 3, {}
 
 
 def test_actions_are_scaled_to_gymnasiums_action_space():
@@ -156,11 +158,52 @@ def test_actions_are_scaled_to_gymnasiums_action_space():
     np.testing.assert_array_equal(lengths, [3, 3])
 
 
-def test_actions_without_bounds_are_rejected():
+class Tower(Ladder):
+    """The same with observations of two parts, and a matrix of integers as its action."""
+
+    observation_space = spaces.Dict({"level": spaces.Discrete(3), "image": spaces.Box(0, 255, (2, 2), np.uint8)})
+    action_space = spaces.Box(0, 10, (2, 1), np.int64)
+
+    def observed(self):
+        return {"image": np.full((2, 2), 100, np.uint8), "level": self.steps % 3}
+
+    def reset(self, seed):
+        super().reset(seed)
+        return self.observed(), {}
+
+    def step(self, action):
+        _, *others = super().step(action)
+        return self.observed(), *others
+
+
+def test_observations_are_flattened_and_integer_actions_rounded():
+    seen = []
+
+    def policy(obs):
+        seen.append(obs)
+        return np.array([[0.29, -1.0]])  # 6.45
+
+    returns, _ = evaluate_policy(policy, Tower(), num_episodes=1)
+    assert returns.tolist() == [18]
+    assert [obs.tolist() for obs in seen] == [[[100] * 4 + one_hot] for one_hot in ([1, 0, 0], [0, 1, 0], [0, 0, 1])]
+
+
+@pytest.mark.parametrize("side", ["observation_space", "action_space"])
+def test_spaces_that_no_policy_here_can_have_are_rejected(side):
     env = Ladder()
-    env.action_space = type("Box", (), {"low": np.array([-np.inf]), "high": np.array([1.0])})()
-    with pytest.raises(ValueError, match="expected an action space with bounds"):
+    setattr(env, side, spaces.Text(5))
+    with pytest.raises(ValueError, match=rf"^{side.replace('_', ' ')}: expects .*Box.*, not Text\("):
         evaluate_policy(lambda obs: obs[:, :1], env)
-    env.action_space = type("Discrete", (), {"n": 2})()
-    with pytest.raises(ValueError, match="expected an action space with bounds"):
-        evaluate_policy(lambda obs: obs, env)
+
+
+@pytest.mark.parametrize("env", [Ladder(), countdown(3)], ids=["gymnasium", "jax"])
+@pytest.mark.parametrize("shape", [(1, 2), (1,), ()])
+def test_a_policy_with_actions_of_another_size_is_rejected(env, shape):
+    message = re.escape(f"policy: expects actions [1, 1] for observations [1, 1], not {list(shape)}")
+    with pytest.raises(ValueError, match=message):
+        evaluate_policy(lambda obs: jnp.zeros(shape), env, num_episodes=1)
+
+
+def test_a_policy_with_actions_that_are_nan_is_rejected():
+    with pytest.raises(ValueError, match="^action: expects numbers in .*, not "):
+        evaluate_policy(lambda obs: obs * np.nan, Ladder())

@@ -83,6 +83,7 @@ NEVER = {
     "sqt_jax.rollout": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
     "sqt_jax.evaluate": ("sqt_jax.agents", "sqt_jax.envs", *REPLAYS),
 }
+EXCEPT = {("sqt_jax.evaluate", "sqt_jax.envs.gym_spaces")}  # converts numbers, makes no environment
 # The agents that an agent may import: TD7 is TD3's successor, and the released code varies all three.
 AGENTS = {
     "critic": (),
@@ -153,7 +154,8 @@ def test_imports_go_downwards(module):
 @pytest.mark.parametrize("module", MODULES)
 def test_parts_that_must_not_import_each_other(module):
     forbidden = NEVER.get(unit(module), ())
-    assert not [other for other in imported(module) for package in forbidden if inside(other, package)]
+    others = {other for other in imported(module) if (module, other) not in EXCEPT}
+    assert not [other for other in others for package in forbidden if inside(other, package)]
 
 
 def test_the_library_imports_neither_experiments_nor_tests():

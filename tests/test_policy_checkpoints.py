@@ -92,7 +92,8 @@ def test_at_the_start_snapshot_and_checkpoint_are_the_policy():
 
 
 @pytest.mark.parametrize(("best", "reset"), [(100.0, 90.0), (-100.0, -90.0)])
-def test_the_best_is_lowered_only_at_the_switch(best, reset):
+def test_the_best_is_multiplied_by_the_reset_weight_only_at_the_switch(best, reset):
+    """A negative one too, as in TD7's code, although it is then harder to reach."""
     state = START._replace(best_min_return=jnp.float32(best))
-    lowered = [policy_checkpoints.lower_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
-    np.testing.assert_allclose([float(state.best_min_return) for state in lowered], [best, reset, best], rtol=1e-6)
+    found = [policy_checkpoints.weight_best(CONFIG, state, jnp.int32(k)) for k in range(SWITCH - 1, SWITCH + 2)]
+    np.testing.assert_allclose([float(state.best_min_return) for state in found], [best, reset, best], rtol=1e-6)

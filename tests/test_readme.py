@@ -108,7 +108,7 @@ def test_python_examples_run(example, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_loop_of_the_guide_trains_td7_too():
-    (code,) = (code for _, code in PYTHON if "gymnasium.make" in code)
+    (code,) = (code for _, code in PYTHON if "gymnasium.make(" in code)
     for shown, td7 in [('"td3_sqt"', '"td7_sqt"'), ("replay.uniform", "lap.lap"), ("import replay", "import lap")]:
         assert code.count(shown) == 1
         code = code.replace(shown, td7)

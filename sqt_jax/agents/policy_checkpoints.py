@@ -80,11 +80,15 @@ def assess(
     )
 
 
-def lower_best(config: AgentConfig, state: PolicyCheckpoints, step: Array) -> PolicyCheckpoints:
-    """At the switch, once: the best minimum is of one episode, and the minimum of several is harder to reach."""
+def weight_best(config: AgentConfig, state: PolicyCheckpoints, step: Array) -> PolicyCheckpoints:
+    """At the switch, once: multiplies the best minimum by the reset weight, as TD7's code does.
+
+    It is of one episode, and the minimum of several is harder to reach. A positive one becomes easier to reach; a
+    negative one moves towards 0, which makes it harder (https://github.com/sfujim/TD7, `train_and_reset` in TD7.py).
+    """
     at_switch = step == config.policy_checkpoint_switch
-    lowered = state.best_min_return * config.policy_checkpoint_reset_weight
-    return state._replace(best_min_return=jnp.where(at_switch, lowered, state.best_min_return))
+    weighted = state.best_min_return * config.policy_checkpoint_reset_weight
+    return state._replace(best_min_return=jnp.where(at_switch, weighted, state.best_min_return))
 
 
 def status(state: PolicyCheckpoints) -> Metrics:
@@ -134,7 +138,7 @@ def around(config: AgentConfig, learner: Parts, explore: Callable[[Array, Array]
     ) -> tuple[CheckpointedState, Array, Metrics]:
         learned, td_error, metrics = learner.update(state.learner, batch, draws, step)
         # The barrier: XLA would copy networks that an update does not change at each environment step.
-        checkpoints = lower_best(config, jax.lax.optimization_barrier(state.checkpoints), step + 1)
+        checkpoints = weight_best(config, jax.lax.optimization_barrier(state.checkpoints), step + 1)
         return CheckpointedState(learner=learned, checkpoints=checkpoints), td_error, metrics
 
     def observe(state: CheckpointedState, episode_return: Array, ended: Array, step: Array) -> CheckpointedState:

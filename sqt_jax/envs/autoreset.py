@@ -16,6 +16,9 @@ The contract of the environments it makes (one test per sentence in tests/test_a
 - A step whose reward or observation is not finite, or beyond 1e10 (the physics diverged), ends the episode: terminated,
   reward 0, and `final_obs` is the observation before it, so that every output stays finite.
 - `status` counts these steps, over all episodes, as `unstable_steps`.
+- A start whose observation is not finite, or beyond 1e10, is replaced by the last finite start of this environment.
+- As long as there is none, and in `set_physics`, the numbers of such an observation that are not finite become 0.
+- `status` counts these starts as `unstable_starts`.
 - `speed` is that of the step just made; after the end of an episode, that of the new start.
 """
 
@@ -24,7 +27,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sqt_jax.conditional import cond_if_any
 from sqt_jax.types import Array, Environment, Metrics, State, TimeStep
@@ -45,7 +47,14 @@ class EpisodeState(NamedTuple):
     task: State  # the state of `start` and `advance` (for the Gymnasium tasks: a `PhysicsState`)
     steps: Array  # [] int32: steps made in this episode
     key: Array  # [] typed key: draws the starts of the next episodes
+    start_key: Array  # [] typed key: of the last finite start, which replaces one that is not
     unstable: Array  # [] int32: steps so far, over all episodes, in which the physics diverged
+    unstable_starts: Array  # [] int32: starts so far whose observation was not finite
+
+
+def in_range(x: Array) -> Array:
+    """Which numbers are finite and not beyond `LARGEST`: a bool for each."""
+    return jnp.abs(x) < LARGEST  # false for NaN too
 
 
 def make_environment(
@@ -74,7 +83,8 @@ def make_environment(
     `start` and `advance` are JAX code for a single environment, without a batch axis: training calls them under `jit`
     and `vmap`. They know nothing of episodes: `make_environment` adds the time limit, clips actions to [-1, 1] and ends
     an episode whose numbers are no longer finite. After each end it calls `start` again (the auto-reset): the time step
-    then has the state and `obs` of the new episode, and the old one's last observation as `final_obs`.
+    then has the state and `obs` of the new episode, and the old one's last observation as `final_obs`. A start that is
+    not finite is replaced by the last one that was.
 
     They must not have side effects, draw random numbers other than from `key` (for noise in `advance`, keep a
     key in the state and split it), branch in Python on a traced value, count the time limit, or start a new episode
@@ -99,11 +109,24 @@ def make_environment(
       env=env)`.
     """
 
-    def begin(task: State, obs: Array, key: Array, unstable: Array) -> TimeStep:
+    def begin(key: Array) -> tuple[State, Array]:
+        task, obs = start(key)
+        return task, jnp.asarray(obs, jnp.float32)
+
+    def first_timestep(task: State, obs: Array, key: Array, start_key: Array) -> TimeStep:
+        finite = in_range(obs)
+        obs = jnp.where(finite, obs, 0)
         false = jnp.zeros((), bool)
-        obs = jnp.asarray(obs, jnp.float32)
+        state = EpisodeState(
+            task=task,
+            steps=jnp.zeros((), jnp.int32),
+            key=key,
+            start_key=start_key,
+            unstable=jnp.zeros((), jnp.int32),
+            unstable_starts=(~jnp.all(finite)).astype(jnp.int32),
+        )
         return TimeStep(
-            state=EpisodeState(task=task, steps=jnp.zeros((), jnp.int32), key=key, unstable=unstable),
+            state=state,
             obs=obs,
             reward=jnp.zeros((), jnp.float32),
             terminated=false,
@@ -111,25 +134,32 @@ def make_environment(
             final_obs=obs,
         )
 
-    no_steps = np.zeros((), np.int32)
-
-    def new_episode(key: Array, unstable: Array) -> TimeStep:
-        start_key, next_key = jax.random.split(key)
-        return begin(*start(start_key), next_key, unstable)
-
     def reset(key: Array) -> TimeStep:
-        return new_episode(key, jnp.asarray(no_steps))
+        start_key, next_key = jax.random.split(key)
+        return first_timestep(*begin(start_key), next_key, start_key)
 
-    def restart(old: tuple[EpisodeState, Array], _: Any) -> tuple[State, Array]:
+    def restart(old: tuple[EpisodeState, Array], _: Any) -> tuple[EpisodeState, Array]:
         episode, _ = old
-        first = new_episode(episode.key, episode.unstable)
-        return first.state, first.obs
+        start_key, next_key = jax.random.split(episode.key)
+        begun = begin(start_key)
+        finite = jnp.all(in_range(begun[1]))
+        # Computed again, and rarely: a second state of the task would be carried through all steps.
+        task, obs = cond_if_any(~finite, lambda _, key: begin(key), begun, given=episode.start_key)
+        state = EpisodeState(
+            task=task,
+            steps=jnp.zeros((), jnp.int32),
+            key=next_key,
+            start_key=jnp.where(finite, start_key, episode.start_key),
+            unstable=episode.unstable,
+            unstable_starts=episode.unstable_starts + (~finite).astype(jnp.int32),
+        )
+        return state, jnp.where(in_range(obs), obs, 0)
 
     def step(timestep: TimeStep, action: Array) -> TimeStep:
         episode: EpisodeState = timestep.state
         task, obs, reward, terminated = advance(episode.task, jnp.clip(action, -1, 1))
         obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(reward, jnp.float32)
-        finite = (jnp.abs(reward) < LARGEST) & jnp.all(jnp.abs(obs) < LARGEST)  # false for NaN too
+        finite = in_range(reward) & jnp.all(in_range(obs))
         reward = jnp.where(finite, reward, 0)
         final_obs = jnp.where(finite, obs, timestep.obs)
         terminated = jnp.asarray(terminated, bool) | ~finite
@@ -138,7 +168,7 @@ def make_environment(
         truncated = steps >= episode_length
 
         ended = terminated | truncated
-        state = EpisodeState(task=task, steps=steps, key=episode.key, unstable=unstable)
+        state = episode._replace(task=task, steps=steps, unstable=unstable)
         state, obs = cond_if_any(ended, restart, (state, final_obs))
         return TimeStep(
             state=state,
@@ -151,10 +181,11 @@ def make_environment(
 
     def set_physics(qpos: Array, qvel: Array) -> TimeStep:
         assert place is not None
-        return begin(*place(qpos, qvel), jax.random.key(0), jnp.asarray(no_steps))
+        task, obs = place(qpos, qvel)
+        return first_timestep(task, jnp.asarray(obs, jnp.float32), jax.random.key(0), start_key=jax.random.key(1))
 
     def status(timestep: TimeStep) -> Metrics:
-        return {"unstable_steps": timestep.state.unstable}
+        return {"unstable_steps": timestep.state.unstable, "unstable_starts": timestep.state.unstable_starts}
 
     return Environment(
         name=name,
