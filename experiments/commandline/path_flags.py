@@ -4,6 +4,8 @@ from absl import flags as absl_flags
 
 from experiments.surroundings import paths
 
+absl_flags.disclaim_key_flags()  # --help lists a flag with the module that defines it by this one
+
 
 class _PathParser(absl_flags.ArgumentParser):
     syntactic_help = "a path"
