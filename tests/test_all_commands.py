@@ -11,7 +11,13 @@ from experiments.run import main
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.envs import PHYSICS, TASKS, lacks
 
-HERE = [pytest.param(name, marks=pytest.mark.skipif(bool(lacks(name)), reason=lacks(name))) for name in PHYSICS]
+# A task's version 5 has the physics of its version 4: it is compiled on the fastest physics only.
+CASES = [
+    pytest.param(task, name, marks=pytest.mark.skipif(bool(lacks(name)), reason=lacks(name)))
+    for task in TASKS
+    for name in PHYSICS
+    if name == "mujoco" or not task.endswith("-v5")
+]
 TINY = ["--steps=300", "--warmup_steps=290", "--eval_every=300", "--eval_episodes=1", "--name=tiny", "--quiet"]
 
 
@@ -31,8 +37,7 @@ def test_every_algorithm_starts(algo, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("physics", HERE)
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize(("env", "physics"), CASES)
 def test_every_task_starts_on_all_physics(env, physics, tmp_path):
     starts("td3_sqt", env, tmp_path, f"--physics={physics}", f"--eval_physics={physics}")
 
