@@ -57,21 +57,31 @@ def test_the_errors_of_a_run_that_failed_are_printed(child, capfd, code, printed
     assert capfd.readouterr() == ("", "why\n" if printed else "")
 
 
-@pytest.mark.parametrize("trap", ["trap 'exit 130' TERM", "trap 'exit 0' TERM", ""], ids=["saved", "ended", "killed"])
-def test_a_sigterm_is_forwarded(child, tmp_path, trap):
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize(
+    ("number", "trap"),
+    [
+        (signal.SIGTERM, "trap 'exit 130' TERM"),
+        (signal.SIGTERM, "trap 'exit 0' TERM"),
+        (signal.SIGTERM, ""),
+        (signal.SIGUSR1, "trap 'exit 130' USR1"),
+        (signal.SIGHUP, ""),
+    ],
+    ids=["saved", "ended", "killed", "announced", "hung up"],
+)
+def test_a_signal_is_forwarded(child, tmp_path, number, trap):
+    before = signal.getsignal(number)
     began = tmp_path / "began"
 
     def terminate():
         while not began.exists():
             time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=terminate, daemon=True)
     thread.start()
     assert train_in_process(child(f"{trap}\ntouch {began}\nwhile :; do sleep 0.05; done")) == 130
     thread.join()
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert signal.getsignal(number) == before
 
 
 def test_a_grid_is_trained_once(tmp_path):

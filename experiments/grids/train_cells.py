@@ -11,13 +11,14 @@ from typing import Any
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED
 from experiments.grids.grid import GridCell, finished, needs_training
 from experiments.running.progress import format_seconds
+from experiments.running.signals import announcements
 
 
 def train_in_process(cell: GridCell) -> int:
     """Trains a cell by `experiments.run` and returns its exit code.
 
-    Its output goes to a file NAME.log.txt next to the run's folder; errors are also printed. SIGINT and SIGTERM reach
-    the run, which then saves a checkpoint.
+    Its output goes to a file NAME.log.txt next to the run's folder; errors are also printed. SIGINT, SIGTERM and the
+    signals that announce an end reach the run, which then saves a checkpoint.
     """
     cell.path.parent.mkdir(parents=True, exist_ok=True)
     with (cell.path.parent / f"{cell.path.name[:100]}.log.txt").open("a") as log:
@@ -31,7 +32,7 @@ def train_in_process(cell: GridCell) -> int:
             if process:
                 process.send_signal(number)
 
-        before = signal.signal(signal.SIGTERM, forward)
+        before = {number: signal.signal(number, forward) for number in (signal.SIGTERM, *announcements())}
         try:
             process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True)
             if stopped:  # before the process existed
@@ -43,7 +44,8 @@ def train_in_process(cell: GridCell) -> int:
                 except KeyboardInterrupt:  # Ctrl-C reaches the run too
                     stopped = True
         finally:
-            signal.signal(signal.SIGTERM, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
     code = process.returncode
     if stopped and code not in (FAILED, BAD_USAGE):  # also if the run had just ended or just started
         return INTERRUPTED

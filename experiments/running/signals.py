@@ -17,6 +17,11 @@ ANNOUNCEMENTS = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
 SAME_SIGNAL_SECONDS = 1.0
 
 
+def announcements() -> list[signal.Signals]:
+    """`ANNOUNCEMENTS` without those that are ignored, as SIGHUP is under `nohup`."""
+    return [number for number in ANNOUNCEMENTS if signal.getsignal(number) != signal.SIG_IGN]
+
+
 @contextmanager
 def stop_on_signal() -> Iterator[list[int]]:
     """Collects the signals in the list that it yields; a second SIGINT or SIGTERM ends the process at once.
@@ -42,7 +47,7 @@ def stop_on_signal() -> Iterator[list[int]]:
                 os.write(2, b"stopping when the running chunk of training or evaluation ends\n")
         received.append(number)
 
-    handled = [*SIGNALS, *(number for number in ANNOUNCEMENTS if signal.getsignal(number) != signal.SIG_IGN)]
+    handled = [*SIGNALS, *announcements()]
     if threading.current_thread() is not threading.main_thread():
         handled = []  # Python allows handlers in the main thread only: signals are its caller's
     before = {number: signal.signal(number, handle) for number in handled}
