@@ -1,9 +1,13 @@
 """Colours, lines and panels of figures."""
 
+import io
+
+import matplotlib
 import numpy as np
 from figure_reader import legend_of, panels
 from made_runs import write_run
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
 from experiments.evidence.figure_style import (
     ALGORITHM_COLOURS,
@@ -11,6 +15,7 @@ from experiments.evidence.figure_style import (
     Stars,
     add_texts,
     algorithm_style,
+    in_our_style,
     make_panels,
     styles,
 )
@@ -71,3 +76,20 @@ def test_many_tasks_are_wrapped_into_rows(tmp_path):
         write_run(tmp_path, env=env)
     figure = finished(collect([str(tmp_path)]))
     assert [axes.get_title() for axes in panels(figure)] == ["cheetah", "walker", "ant", "humanoid", "hopper"]
+
+
+def test_figures_do_not_depend_on_rc_files():
+    """A notebook's or a user's settings, set after matplotlib was imported."""
+
+    @in_our_style
+    def picture():
+        figure = Figure(figsize=(2, 2))
+        figure.add_subplot().plot([0, 1], label="$")
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png")
+        return stream.getvalue()
+
+    before = picture()
+    with matplotlib.rc_context({"text.usetex": True, "savefig.dpi": 7, "lines.linewidth": 9}):
+        assert picture() == before
+        assert matplotlib.rcParams["savefig.dpi"] == 7  # the user's own settings are as before

@@ -1,5 +1,6 @@
 """Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
 
+import errno
 import json
 import os
 import subprocess
@@ -49,6 +50,36 @@ def test_a_lock_is_released(tmp_path):
         raise KeyError
     with files.locked(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("number", files.NOT_SUPPORTED)
+def test_a_file_system_without_locks_or_fsync_is_used_with_a_warning(tmp_path, monkeypatch, number):
+    def refuse(*arguments):
+        raise OSError(number, "not supported")
+
+    monkeypatch.setattr(files.fcntl, "flock", refuse)
+    monkeypatch.setattr(files.os, "fsync", refuse)
+    lines = []
+    with files.locked(tmp_path / "run", lines.append):
+        with files.atomic_file(tmp_path / "run" / "a") as file:
+            file.write(b"content")
+        files.sync(tmp_path)
+    assert (tmp_path / "run" / "a").read_bytes() == b"content"
+    assert len(lines) == 1 and "has no locks" in lines[0]
+
+
+def test_another_error_of_a_lock_is_raised(tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(files.fcntl, "flock", refuse)
+    with pytest.raises(OSError, match="Input/output"), files.locked(tmp_path / "run"):
+        pass
+
+
+def test_new_folders_have_different_names(tmp_path):
+    made = [files.new_folder(tmp_path / "a" / "run") for _ in range(3)]
+    assert [path.name for path in made] == ["run", "run-2", "run-3"] and all(path.is_dir() for path in made)
 
 
 def test_a_lock_that_is_a_link_is_not_written_through(tmp_path):
