@@ -41,6 +41,7 @@ def test_an_announced_end_stops_a_run_and_may_be_repeated(monkeypatch, number):
     """A batch system announces the end, then sends SIGTERM: the run is still saving."""
     codes = []
     monkeypatch.setattr(signals.os, "_exit", codes.append)
+    monkeypatch.setattr(signals, "announcements", lambda: signals.ANNOUNCEMENTS)  # nohup around the tests ignores one
     with signals.stop_on_signal() as received:
         for sent in (number, number, signal.SIGTERM):
             signal.raise_signal(sent)
