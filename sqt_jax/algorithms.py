@@ -99,6 +99,8 @@ def features_of(row: Algorithm, config: AgentConfig) -> frozenset[str]:
     if config.networks == "sale":
         found.add("sale")
         found.discard("soft_targets")
+    else:
+        found.add("mlp")
     return frozenset(found)
 
 

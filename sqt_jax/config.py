@@ -17,6 +17,7 @@ FEATURES = {
     "soft_targets": "soft target updates (td3, sac, maxmin, redq)",
     "noise": "noise on deterministic actions (td3, td7, maxmin)",
     "entropy": "an entropy term (sac, redq)",
+    "mlp": "MLP networks (td3, sac, maxmin, redq)",
     "sale": "SALE networks (td7, --networks=sale)",
     "checkpoints": "prioritised replay and policy checkpoints (td7)",
 }
@@ -42,6 +43,7 @@ class AgentConfig:
     # Networks.
     ensemble_size: int = setting(2, "number of critics", low=1, high=1000)
     hidden: tuple[int, ...] = setting((256, 256), "widths of the hidden layers")
+    layer_norm: bool = setting(False, "normalise the critics' hidden layers before their ReLU", features=("mlp",))
     # Optimisation.
     lr: float = setting(3e-4, "Adam's learning rate", low=0, high=1, swept=True)
     gamma: float = setting(0.99, "discount factor", low=0, high=1, swept=True)

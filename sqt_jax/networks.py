@@ -35,10 +35,18 @@ class Dense(nn.Module):
         return sum(x @ part for x, part in zip(inputs, rows, strict=True)) + bias
 
 
-def hidden_layers(x: Array, hidden: Sequence[int]) -> Array:
-    """ReLU layers `layer0`, `layer1`, ... of the calling module."""
+def hidden_layers(x: Array, hidden: Sequence[int], layer_norm: bool = False) -> Array:
+    """ReLU layers `layer0`, `layer1`, ... of the calling module.
+
+    Args:
+      layer_norm: whether each is normalised before its ReLU, by `norm0`, `norm1`, ...
+        (https://arxiv.org/abs/1607.06450).
+    """
     for i, width in enumerate(hidden):
-        x = nn.relu(Dense(width, name=f"layer{i}")(x))
+        x = Dense(width, name=f"layer{i}")(x)
+        if layer_norm:
+            x = nn.LayerNorm(name=f"norm{i}")(x)
+        x = nn.relu(x)
     return x
 
 
@@ -58,17 +66,22 @@ class Critic(nn.Module):
     """One Q function: obs [B, O], action [B, A] -> [B]."""
 
     hidden: Sequence[int]
+    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, obs: Array, action: Array) -> Array:
-        x = hidden_layers(jnp.concatenate([obs, action], axis=-1), self.hidden)
+        x = hidden_layers(jnp.concatenate([obs, action], axis=-1), self.hidden, self.layer_norm)
         return Dense(1, name=f"layer{len(self.hidden)}")(x)[..., 0]
 
 
-def ensemble(module: type[nn.Module], ensemble_size: int, hidden: Sequence[int]) -> Network:
-    """N independent modules as one: parameters and outputs get a leading axis N, inputs are shared."""
+def ensemble(module: type[nn.Module], ensemble_size: int, *settings: Any) -> Network:
+    """N independent modules as one: parameters and outputs get a leading axis N, inputs are shared.
+
+    Args:
+      settings: the fields of each module.
+    """
     axes: dict[str, Any] = {"variable_axes": {"params": 0}, "split_rngs": {"params": True}}
-    made = nn.vmap(module, axis_size=ensemble_size, **axes)(hidden)
+    made = nn.vmap(module, axis_size=ensemble_size, **axes)(*settings)
 
     def copies(
         inputs: Sequence[Array],

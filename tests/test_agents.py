@@ -390,6 +390,15 @@ def test_the_actor_climbs_the_mean_of_the_updated_critics(algo):
         np.testing.assert_array_equal(np.sign(step[clear]), np.sign(slope[clear]))
 
 
+@pytest.mark.parametrize("algo", [algo for algo in BASES if default_agent_config(algo).networks == "mlp"])
+def test_layer_norm_is_in_the_critics_and_their_targets_only(algo):
+    config = dataclasses.replace(default_agent_config(algo), layer_norm=True, hidden=(8, 8))
+    state = jax.eval_shape(make_parts(algo, config, O, A).agent.init, KEY)
+    layers = {*state.critic["params"]}
+    assert {"norm0", "norm1"} <= layers == {*state.target_critic["params"]}
+    assert not [name for name in state.actor["params"] if name.startswith("norm")]
+
+
 @every_algorithm
 def test_each_networks_first_step_has_the_learning_rates_length(algo):
     scalars = subject(algo).config.scalars()._replace(lr=1e-3)

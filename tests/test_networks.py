@@ -57,6 +57,28 @@ def test_critics_have_a_leading_axis(n):
     assert shapes(params) == {"params": expected}
 
 
+def test_a_normalised_layer_by_hand():
+    """Hidden values 1 and 3: mean 2, std 1, so -1 and 1; times the scale, plus the shift, then ReLU."""
+    critic = networks.Critic((2,), layer_norm=True)
+    params = {
+        "layer0": {"kernel": jnp.array([[1.0, 3.0], [0.0, 0.0]]), "bias": jnp.zeros(2)},
+        "norm0": {"scale": jnp.array([2.0, 3.0]), "bias": jnp.array([2.5, 0.5])},
+        "layer1": {"kernel": jnp.array([[10.0], [1.0]]), "bias": jnp.array([0.25])},
+    }
+    obs, action = jnp.ones((1, 1)), jnp.ones((1, 1))
+    found = critic.apply({"params": params}, obs, action)
+    np.testing.assert_allclose(found, [10 * 0.5 + 3.5 + 0.25], rtol=1e-5)
+    # The size of an observation does not matter to the first layer.
+    np.testing.assert_allclose(critic.apply({"params": params}, 1000 * obs, action), found, rtol=1e-5)
+
+
+def test_normalised_critics_are_separate_and_start_as_the_others():
+    plain = networks.ensemble(networks.Critic, N, HIDDEN).init(KEY, OBS, ACTION)["params"]
+    normalised = networks.ensemble(networks.Critic, N, HIDDEN, True).init(KEY, OBS, ACTION)["params"]
+    assert shapes(normalised["norm1"]) == {"scale": (N, 6), "bias": (N, 6)}
+    assert all(np.array_equal(plain[name]["kernel"], normalised[name]["kernel"]) for name in plain)
+
+
 @pytest.fixture(scope="module")
 def ensemble():
     net = networks.ensemble(networks.Critic, N, HIDDEN)

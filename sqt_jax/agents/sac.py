@@ -55,7 +55,7 @@ def temperature_loss(log_temperature: Array, log_prob: Array, target_entropy: fl
 def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
     """SAC for observations [B, O] and actions [B, A]."""
     actor_net = gaussian_actor(action_size, config.hidden)
-    critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden)
+    critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden, config.layer_norm)
     target_entropy = -float(action_size)
 
     def init(key: Array, scalars: Scalars | None = None) -> SACState:

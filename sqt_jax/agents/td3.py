@@ -54,7 +54,7 @@ def draw(key: Array, batch: Transition, config: AgentConfig) -> TD3Draws:
 def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
     """TD3 for observations [B, O] and actions [B, A]."""
     actor_net: Any = networks.TanhActor(action_size, config.hidden)
-    critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden)
+    critic_net = networks.ensemble(networks.Critic, config.ensemble_size, config.hidden, config.layer_norm)
 
     def init(key: Array, scalars: Scalars | None = None) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
