@@ -6,14 +6,26 @@ from collections.abc import Sequence
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import BAD_USAGE, DONE, INTERRUPTED, UsageError, printable
 from experiments.surroundings import jax_settings
+from sqt_jax.envs import factories
 from sqt_jax.types import Environment
+
+
+def own_environment(name: str | None) -> Environment | None:
+    """The environment of `--env=MODULE:FUNCTION`; None if `name` has another form. Raises `UsageError`."""
+    if name is None or not factories.is_factory(name):
+        return None
+    try:
+        return factories.make_from(name)
+    except ValueError as error:
+        raise UsageError(f"--env={name}: {error}") from error
 
 
 def main(argv: Sequence[str], env: Environment | None = None) -> int:
     """Runs the command line `argv`, program name first; returns the exit code.
 
     Args:
-      env: an environment of your own, recorded and filed under `env.name`. `--env` is then not required.
+      env: an environment of your own, recorded and filed under `env.name`. `--env` is then not required. From the
+        shell, `--env=MODULE:FUNCTION` calls a function that returns it.
     """
     try:
         if argv and argv[0].startswith("--"):
@@ -23,6 +35,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
             print(flag_table.help_text())
             return DONE
         jax_settings.prepare()
+        env = env or own_environment(options.env)
         # Imports SciPy, TensorBoard, Orbax and matplotlib: a typing error is reported without waiting for them.
         from experiments.running.session import start_session
 

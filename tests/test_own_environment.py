@@ -1,7 +1,10 @@
 """An environment of your own from start to end, as a user has it: train, resume, tables, figures, report, policy."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -13,6 +16,25 @@ from experiments import play, plots, report, run, tables
 
 ARGV = ["run", "--algo=td3_sqt", "--seeds=0,1", "--steps=40", "--warmup_steps=20", "--eval_every=20", "--quiet"]
 ARGV += ["--hidden=16,16", "--batch_size=16", "--eval_episodes=1", "--checkpoint_every=20", "--notensorboard"]
+
+
+ROOT = Path(__file__).resolve().parent.parent
+MODULE = """
+import jax
+import jax.numpy as jnp
+import sqt_jax
+
+def make():
+    def start(key):
+        x = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
+        return x, x
+
+    def advance(x, action):
+        x = x + 0.1 * action
+        return x, x, -jnp.abs(x[0]), jnp.abs(x[0]) > 2.0
+
+    return sqt_jax.make_environment("slope", 1, 1, 10, start, advance)
+"""
 
 
 def make_point(name="point", size=1):
@@ -48,7 +70,9 @@ def test_an_environment_of_ones_own_from_start_to_end(tmp_path, monkeypatch, cap
     assert run.main([*ARGV, "--resume"], env=env) == 0
     assert capsys.readouterr() == ("", "")
     assert run.main(["run", f"--resume={path}", "--steps=60"]) == 2
-    expected = f"--resume={path}: expects the environment 'point' handed in: run.main(argv, env=...)\n"
+    expected = (
+        f"--resume={path}: expects the environment 'point', by --env=MODULE:FUNCTION or run.main(argv, env=...)\n"
+    )
     assert capsys.readouterr() == ("", expected)
     assert run.main(["run", f"--resume={path}", "--steps=60"], env=make_point(size=3)) == 2
     assert "observation_size (its own: 1, now: 3), action_size (its own: 1, now: 3)" in capsys.readouterr().err
@@ -68,6 +92,8 @@ def test_an_environment_of_ones_own_from_start_to_end(tmp_path, monkeypatch, cap
     capsys.readouterr()
     assert play.main(["play", path]) == 2
     assert f"sqt_jax.load_policy('{path}') and sqt_jax.evaluate_policy(policy, env)" in capsys.readouterr().err
+    assert play.main(["play", path, "--env=test_own_environment:make_point", "--episodes=2"]) == 0
+    assert "episode 1: return" in capsys.readouterr().out
     policy = sqt_jax.load_policy(f"{path}/policy", member=1)
     returns, lengths = sqt_jax.evaluate_policy(policy, env, num_episodes=3)
     assert returns.shape == (3,) and (lengths <= 10).all()
@@ -89,3 +115,28 @@ def test_training_functions_need_the_environment_of_their_configuration():
         with pytest.raises(ValueError, match="an environment of your own called point, given: maze"):
             make(config, make_point("maze"))
         assert make(config, env)
+
+
+@pytest.mark.slow
+def test_a_function_of_a_module_from_start_to_end(tmp_path, monkeypatch, capsys):
+    """`--env=module:function`, from the shell: a module in the current folder."""
+    (tmp_path / "my_tasks.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+
+    def command(*words):
+        variables = os.environ | {"PYTHONPATH": str(ROOT)}
+        made = [sys.executable, "-m", *words]
+        return subprocess.run(made, env=variables, capture_output=True, text=True, cwd=tmp_path)
+
+    train = ["experiments.run", "--env=my_tasks:make", *ARGV[1:], "--name=first"]
+    path = "runs/slope/td3_sqt/first"
+    assert command(*train).returncode == 0
+    refused = command("experiments.run", f"--resume={path}", "--steps=60")
+    assert refused.returncode == 2 and "by --env=MODULE:FUNCTION" in refused.stderr
+    done = command("experiments.run", f"--resume={path}", "--env=my_tasks:make", "--steps=60", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    played = command("experiments.play", path, "--env=my_tasks:make")
+    assert played.returncode == 0 and "episode 0: return" in played.stdout
+    assert command("experiments.tables", "runs").returncode == 0
+    assert command("experiments.report", "runs").returncode == 0
+    assert "experiments.run --env=my_tasks:make --algo=td3_sqt" in (tmp_path / "report.html").read_text()

@@ -160,7 +160,8 @@ def _flags() -> dict[str, list[Flag]]:
                 parse=str,
                 expects="a name",
                 help="environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's "
-                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own",
+                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own; MODULE:FUNCTION: your function that "
+                "returns a sqt_jax.Environment",
                 default="required",
             ),
             *_group(settings_of(Config).values(), None),

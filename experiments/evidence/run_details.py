@@ -16,6 +16,7 @@ from experiments.evidence.pooling import Collected
 from experiments.evidence.run_settings import RunSettings
 from experiments.running import files
 from sqt_jax.algorithms import ALGORITHMS
+from sqt_jax.envs.factories import is_factory
 from sqt_jax.experiment import make_config
 
 MAX_SUMMARY_BYTES = 10_000_000
@@ -181,7 +182,7 @@ def _command(entry: Mapping[str, Any], label: str, own_env: bool) -> Command:
     note = ""
     if any(word.lstrip("-").partition("=")[0] == "config" for word in words[1:]):
         note = "It read flags from a file that is not recorded; the resulting settings are below."
-    if own_env:
+    if own_env and not any(is_factory(word.partition("=")[2] or word) for word in words[1:]):
         label = f"{label} (in Python; env is the environment that was handed in)"
         return Command(f"experiments.run.main({['run', *words[1:]]!r}, env=env)", label, note)
     return Command(shlex.join(["python", "-m", "experiments.run", *words[1:]]), label, note)

@@ -1,6 +1,7 @@
 """Playing the policy of a run: episodes, their printed returns, and a film or MuJoCo's viewer."""
 
 import argparse
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     returns = policies.member_returns(run, len(described.members), best)
     at = "by its best evaluation" if best else "at the last evaluation"
     chosen = policies.choose(described, returns, options.seed, options.member, at)
-    task = make_played_task(chosen.member.config, options.physics, options.camera)
+    task = make_played_task(chosen.member.config, options.physics, options.camera, options.env)
     loaded = policies.load(run, chosen, task.env, best)
     caption = policies.caption(described, chosen)
     print(caption)
@@ -46,10 +47,13 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     console = consoles.console(stderr=True)
     played = play_episodes(task, loaded.policy, options, console)
     for number, episode in enumerate(played):
-        length = f"{episode.length:,} steps, {episode.length * task.period:.1f} s"
+        seconds = "" if math.isnan(task.period) else f", {episode.length * task.period:.1f} s"
+        length = f"{episode.length:,} steps{seconds}"
         print(f"episode {number}: return {episode.total:,.1f}, {length}, {episodes.ending(episode)}", flush=True)
     if options.video:
         film_episodes(task, played, options, caption, console)
+    elif task.scene is None:
+        return
     elif is_brax(task.env.name):
         print("--video=FILE.html writes a film")
     elif not (graphics.has_display() and graphics.works("glfw")):

@@ -33,6 +33,7 @@ def parser() -> Parser:
     add("--episodes", type=between(1, 1000), default=1, metavar="N", help="number of episodes (1)")
     add("--steps", type=between(1, 1_000_000), metavar="N", help="maximum steps of an episode (the task's time limit)")
     add("--start_seed", type=between(0, MAX_SEED), default=0, metavar="N", help="seed of the initial states (0)")
+    add("--env", metavar="MODULE:FUNCTION", help="of a run on an environment of your own: a function that returns it")
     add("--physics", metavar="NAME", help="physics of the episodes (mujoco; for brax:ENV the run's)")
     add("--video", type=film, metavar="FILE", help="write a film: .mp4, .gif or .html; for brax:ENV only .html")
     add("--size", type=size, metavar="WIDTHxHEIGHT", help="size of the film in pixels (640x480)")
@@ -71,11 +72,17 @@ def check(run: Path, options: argparse.Namespace) -> None:
     """
     if not run.is_dir():
         raise UsageError(f"{run}: there is no such folder")
-    if _setting(run, "physics") == "own":  # `sqt_jax.experiment.OWN_PHYSICS`, without importing JAX
+    own = _setting(run, "physics") == "own"  # `sqt_jax.experiment.OWN_PHYSICS`, without importing JAX
+    if own and options.env is None:
         raise UsageError(
-            f"{run}: expects a run on one of the library's environments; this one's was handed in from Python: there, "
-            f"use sqt_jax.load_policy({str(run)!r}) and sqt_jax.evaluate_policy(policy, env)"
+            f"{run}: expects --env=MODULE:FUNCTION, a function that returns its own environment; or in Python: "
+            f"sqt_jax.load_policy({str(run)!r}) and sqt_jax.evaluate_policy(policy, env)"
         )
+    if not own and options.env is not None:
+        raise UsageError(f"--env: expects a run on an environment of your own; {run} names its environment itself")
+    for flag, given in {"--video": options.video, "--physics": options.physics, "--camera": options.camera}.items():
+        if own and given:
+            raise UsageError(f"{flag}: has no effect with an environment of your own, which cannot be filmed")
     if options.video is None:
         for flag, given in {"--size": options.size, "--overwrite": options.overwrite}.items():
             if given:

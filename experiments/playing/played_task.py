@@ -1,5 +1,6 @@
 """The environment that a run's policy plays in, and its model to show."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,7 +9,8 @@ from experiments.playing import brax_pages, episodes, rendering
 from experiments.playing.play_flags import is_brax
 from sqt_jax import envs
 from sqt_jax.config import Config
-from sqt_jax.envs import brax_envs, gym_tasks
+from sqt_jax.envs import brax_envs, factories, gym_tasks
+from sqt_jax.experiment import env_of
 from sqt_jax.types import Environment, TimeStep
 
 
@@ -17,22 +19,29 @@ class PlayedTask(NamedTuple):
 
     env: Environment
     physics: str
-    period: float  # seconds per control step
+    period: float  # seconds per control step; NaN: unknown
     look: Callable[[TimeStep], Any]  # the part of a state to keep, as in `episodes.play`
-    scene: Any  # a mujoco.MjModel; for brax:ENV Brax's own environment
+    scene: Any  # a mujoco.MjModel; for brax:ENV Brax's own environment; None: it cannot be shown
 
 
-def make_played_task(config: Config, physics: str | None, camera: str) -> PlayedTask:
+def make_played_task(config: Config, physics: str | None, camera: str, factory: str | None = None) -> PlayedTask:
     """The environment that a member was trained on.
 
     Args:
       config: of the member.
       physics: None is `mujoco`, and for brax:ENV the run's.
       camera: the name of one of the model's cameras, or empty.
+      factory: `module:function` of an environment of the user's own.
 
     Raises:
       UsageError: the task has no such physics or camera, or a package for the physics is missing.
     """
+    if factory is not None:
+        try:
+            env = env_of(config, factories.make_from(factory))
+        except ValueError as error:
+            raise UsageError(f"--env={factory}: {error}") from error
+        return PlayedTask(env=env, physics=config.physics, period=math.nan, look=lambda timestep: (), scene=None)
     brax = is_brax(config.env)
     physics = physics or (config.physics if brax else "mujoco")
     if physics not in envs.physics_of(config.env):

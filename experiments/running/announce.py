@@ -80,7 +80,9 @@ class Announcer:
             self._line(f"curves: {self.plan.path / 'curves.png'}")
         if outcome.interrupted and self.plan.output["checkpoint_every"]:
             command = f"python -m experiments.run --resume={shlex.quote(str(self.plan.path))}"
-            if self.plan.own_env:
+            if self.plan.own_env and self.plan.options.env:
+                command += f" --env={self.plan.options.env}"
+            elif self.plan.own_env:
                 command = f"experiments.run.main(['run', {f'--resume={self.plan.path}'!r}], env=env)"
             self._line(f"resume with: {command}")
 

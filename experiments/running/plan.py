@@ -18,6 +18,7 @@ from experiments.running.run_config import Member, RunConfig
 from experiments.surroundings import jax_settings
 from sqt_jax import envs
 from sqt_jax.config import Config, TrainConfig
+from sqt_jax.envs.factories import is_factory
 from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate
 from sqt_jax.job_limits import memory_limits
 from sqt_jax.members import Layout, usable_devices
@@ -117,7 +118,7 @@ def _check_env(options: flags.Options, env: Environment | None) -> None:
         return
     if not isinstance(env, Environment):
         raise UsageError(f"env: expects an Environment (sqt_jax.make_environment), not a {type(env).__name__}")
-    if options.env not in (None, env.name):
+    if options.env not in (None, env.name) and not is_factory(str(options.env)):
         raise UsageError(
             f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
         )
@@ -178,7 +179,9 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
             raise UsageError(f"--resume={path}: expects no environment handed in; the run was trained on {name}")
         wanted |= {"env": env.name} | run_config.sizes_of(env)
     elif run.on_own_env:
-        raise UsageError(f"--resume={path}: expects the environment {name!r} handed in: run.main(argv, env=...)")
+        raise UsageError(
+            f"--resume={path}: expects the environment {name!r}, by --env=MODULE:FUNCTION or run.main(argv, env=...)"
+        )
     elif options.env:
         try:
             wanted["env"] = envs.resolve(options.env)

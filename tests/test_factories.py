@@ -1,0 +1,57 @@
+"""Environments by `module:function`."""
+
+import pytest
+
+from sqt_jax.envs import factories
+
+MODULE = """
+import jax.numpy as jnp
+import sqt_jax
+
+def make():
+    return sqt_jax.make_environment("flat", 1, 1, 10, lambda key: (jnp.zeros(1),) * 2, lambda x, a: (x, x, 0.0, False))
+
+def fail():
+    raise RuntimeError("no\\nsimulator")
+
+def number():
+    return 5
+
+value = 3
+"""
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    (tmp_path / "tasks_of_a_test.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    return "tasks_of_a_test"
+
+
+def test_the_function_of_a_module_is_called(module):
+    assert factories.make_from(f"{module}:make").name == "flat"
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("fail", "RuntimeError: no simulator (tasks_of_a_test.py, line 9)"),
+        ("number", "expects a function that returns an Environment (sqt_jax.make_environment), not a int"),
+        ("value", "TypeError: 'int' object is not callable"),
+        ("none", "AttributeError: module 'tasks_of_a_test' has no attribute 'none'"),
+    ],
+)
+def test_what_is_no_environment_is_an_error_in_one_line(module, function, message):
+    with pytest.raises(ValueError) as error:
+        factories.make_from(f"{module}:{function}")
+    assert str(error.value) == message
+
+
+def test_a_module_that_does_not_exist():
+    with pytest.raises(ValueError, match="^ModuleNotFoundError: No module named 'nowhere'$"):
+        factories.make_from("nowhere.at_all:make")
+
+
+@pytest.mark.parametrize("name", ["ant", "brax:ant", "a:", ":b", "a:b:c", "a.:b", "../a:b", "a b:c", "é:b", "a:b-1"])
+def test_other_names_are_no_functions(name):
+    assert not factories.is_factory(name)
