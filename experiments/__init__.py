@@ -5,6 +5,6 @@ import sys
 from experiments.surroundings import streams, variables
 
 # While Python looks for the module of `python -m experiments.COMMAND`: before any library is imported.
-if sys.argv[:1] == ["-m"]:
+if sys.argv[:1] == ["-m"] and (command := variables.module_of(sys.orig_argv)).startswith("experiments."):
     streams.guard()
-    variables.prepare(sys.orig_argv[sys.orig_argv.index("-m") + 1])
+    variables.prepare(command)

@@ -45,6 +45,8 @@ from sqt_jax import envs
 flags.adopt_module_key_flags(bench_flags)
 
 
+@bench_flags.exit_on_usage_error()
+@jax_settings.needed_switches()
 def main(argv: Sequence[str]) -> None:
     """Checks the flags, measures and prints; exits with 1 and a line if a flag is invalid or a measurement failed."""
     del argv

@@ -34,6 +34,8 @@ for flag_name in BENCH_FLAGS:
 MEMBERS = 5  # environments in parallel when speed is measured
 
 
+@exit_on_usage_error()
+@jax_settings.needed_switches()
 def main(argv: Sequence[str]) -> None:
     """Checks the flags, compares and prints the report; exits with 1 and a line if a flag is invalid."""
     del argv

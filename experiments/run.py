@@ -3,8 +3,10 @@
 import sys
 from collections.abc import Sequence
 
+import jax
+
 from experiments.commandline import flag_table, flags
-from experiments.commandline.arguments import BAD_USAGE, DONE, INTERRUPTED, UsageError, printable
+from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError, printable
 from experiments.surroundings import jax_settings
 from sqt_jax.envs import factories
 from sqt_jax.types import Environment
@@ -34,12 +36,22 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
         if options is None:
             print(flag_table.help_text())
             return DONE
-        jax_settings.prepare()
-        env = env or own_environment(options.env)
-        # Imports SciPy, TensorBoard, Orbax and matplotlib: a typing error is reported without waiting for them.
-        from experiments.running.session import start_session
+        with jax_settings.needed_switches():
+            jax_settings.prepare()
+            env = env or own_environment(options.env)
+            # Imports SciPy, TensorBoard and Orbax: a typing error is reported without waiting for them.
+            from experiments.running.session import start_session
 
-        return start_session(options, env, argv).run()
+            return start_session(options, env, argv).run()
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        advice = (
+            "fewer --seeds or a smaller --replay_capacity need less, and --resume continues from the last checkpoint"
+        )
+        print(printable(f"out of memory ({text}): {advice}"), file=sys.stderr)
+        return FAILED
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE

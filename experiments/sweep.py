@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import app, flags
 
-from experiments.commandline.arguments import BAD_USAGE, UsageError, printable
+from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, reject_folder
 from experiments.commandline.path_flags import define_path
 from experiments.grids.grid import GRIDS, make_cells
 from experiments.grids.train_cells import train_cells, train_in_process
@@ -22,11 +22,15 @@ FLAGS = flags.FLAGS
 def main(argv: Sequence[str]) -> int:
     """Trains the grid; `argv` has the program name and the flags for every run. Returns the exit code."""
     try:
+        reject_folder("--out", Path(FLAGS.out))
         cells = make_cells(FLAGS.grid, FLAGS.algos, FLAGS.tasks, Path(FLAGS.out), argv[1:])
+        return train_cells(cells, train_in_process, lambda line: print(line, flush=True))
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
-    return train_cells(cells, train_in_process, lambda line: print(line, flush=True))
+    except OSError as error:  # of a cell's log
+        print(printable(f"--out={FLAGS.out}: expects a folder that can be written: {error}"), file=sys.stderr)
+        return BAD_USAGE
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def _groups(controller: str, root: Path) -> Iterator[Path]:
             names = controllers.split(",")
             tops = [mounted / controllers, mounted / controller] if controller in names else []
         else:
-            tops = [mounted, mounted / "unified"]
+            tops = [mounted / "unified", mounted]  # beside version 1, or alone
         top = next((folder for folder in tops if folder.is_dir()), None)
         if top is None:
             continue

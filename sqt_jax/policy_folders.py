@@ -51,17 +51,21 @@ def read_first(run: Path, best: bool, read: Callable[[Path], Result]) -> tuple[R
     Training that still runs may remove a checkpoint while it is read: the next one is read then.
 
     Args:
-      read: is called with a folder, and raises FileNotFoundError if a file is missing in it.
+      read: is called with a folder, and raises OSError or ValueError if a file in it is missing or damaged. Only
+        checkpoints have a next one: an error in the run's own folder is raised.
 
     Raises:
-      FileNotFoundError: there is no such folder, or files are missing in all of them.
+      FileNotFoundError: there is no such folder.
+      OSError, ValueError: of `read`, the first one.
     """
-    tried: dict[PolicyFolder, FileNotFoundError] = {}
+    tried: dict[PolicyFolder, Exception] = {}
     # Found again each time: a checkpoint may have been added since the last one was removed.
     while left := [folder for folder in find(run, best) if folder not in tried]:
         try:
             return read(left[0].path), left[0]
-        except FileNotFoundError as error:
+        except (OSError, ValueError) as error:
+            if left[0].env_steps is None and not isinstance(error, FileNotFoundError):
+                raise
             tried[left[0]] = error
     if tried:
         raise next(iter(tried.values()))
@@ -75,5 +79,5 @@ def _has_links(folder: Path) -> bool:
     """Whether a checkpoint's folder of policies, or anything in it, is a link; also if it has been removed."""
     try:
         return any(item.is_symlink() for item in (folder.parent, folder, *folder.iterdir()))
-    except FileNotFoundError:
+    except OSError:  # also of a file system that has lost it
         return True

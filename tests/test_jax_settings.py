@@ -5,8 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import pytest
 import test_plan
 
+from experiments.commandline.arguments import UsageError
+from experiments.surroundings import jax_settings
 from sqt_jax.job_limits import usable_cores
 
 ROOT = Path(__file__).parents[1]
@@ -30,6 +34,31 @@ def devices_of_a_run(*arguments):
         command, check=True, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, cwd=ROOT
     )
     return tuple(map(int, found.stdout.split()))
+
+
+def test_switches_are_the_callers_again_afterwards(capsys):
+    names = {"jax_enable_x64": True, "jax_numpy_rank_promotion": "raise"}
+    before = {name: jax.config.values[name] for name in names}
+    try:
+        for name, value in names.items():
+            jax.config.update(name, value)
+        with jax_settings.needed_switches():
+            assert {name: jax.config.values[name] for name in names} == before
+        assert {name: jax.config.values[name] for name in names} == names
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+    assert "JAX_ENABLE_X64, JAX_NUMPY_RANK_PROMOTION: has no effect" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", jax_settings.REFUSED)
+def test_a_switch_that_asks_for_something_else_is_refused(name):
+    jax.config.update(name, True)
+    try:
+        with pytest.raises(UsageError, match=f"{name.upper()}: expects it to be off"), jax_settings.needed_switches():
+            pass
+    finally:
+        jax.config.update(name, False)
 
 
 def seeds(count):

@@ -38,8 +38,11 @@ def options(folder, *flags):
 def test_a_film_of_a_mujoco_model_sets_mujoco_gl(tmp_path, monkeypatch):
     monkeypatch.setattr(graphics, "choose", lambda: "osmesa")
     monkeypatch.setenv("MUJOCO_GL", "other")
-    play_flags.choose_graphics(tmp_path, options(tmp_path))
-    assert os.environ["MUJOCO_GL"] == "other"  # no film
+    for display, value in ((True, None), (False, "disable")):  # no film
+        monkeypatch.setattr(graphics, "has_display", lambda display=display: display)
+        play_flags.choose_graphics(tmp_path, options(tmp_path))
+        assert os.environ.get("MUJOCO_GL") == value
+    monkeypatch.setenv("MUJOCO_GL", "other")
     (tmp_path / "config.json").write_text('{"settings": {"env": "brax:ant"}}')
     play_flags.choose_graphics(tmp_path, options(tmp_path, "--video=film.html"))
     assert os.environ["MUJOCO_GL"] == "other"  # Brax's viewer

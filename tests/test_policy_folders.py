@@ -46,6 +46,25 @@ def test_if_training_removes_a_checkpoint_while_it_is_read_the_next_one_is_read(
     assert (text, found.env_steps) == ("policy of step_0000000040", 40)
 
 
+def test_a_damaged_checkpoint_is_skipped_and_a_damaged_policy_of_the_run_is_not(run):
+    newest, older, _ = (found.path for found in policy_folders.find(run))
+    damaged = {newest}
+
+    def read_valid(folder):
+        if folder in damaged:
+            raise ValueError(f"{folder} is damaged")
+        return read(folder)
+
+    assert policy_folders.read_first(run, False, read_valid)[1].path == older
+    damaged |= {found.path for found in policy_folders.find(run)}
+    with pytest.raises(ValueError, match=newest.parent.name):
+        policy_folders.read_first(run, False, read_valid)
+    (run / "policy").mkdir()
+    damaged = {run / "policy"}
+    with pytest.raises(ValueError, match="policy is damaged"):
+        policy_folders.read_first(run, False, read_valid)
+
+
 def test_a_checkpoint_that_was_written_in_the_meantime_is_read(run):
     """With --keep_checkpoints=1 none of those that were found may be left."""
 

@@ -165,7 +165,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
         raise UsageError(
             f"--name={name[:40]}: expects up to 200 bytes, no slashes or control characters: it names a folder"
         )
-    out = "runs" if own["out"] is None else _folder("out", own["out"])
+    out = _folder("out", "runs" if own["out"] is None else own["out"])
     if folder_given:
         resume = _folder("resume", resume)
 
@@ -221,17 +221,17 @@ def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _folder(flag: str, text: str) -> str:
-    """The folder that a flag names; a YAML file can ask for one that no folder can have."""
-    try:
-        valid = text and b"\0" not in os.fsencode(text)
-    except UnicodeEncodeError:
-        valid = False
-    if not valid:
+    """The folder that a flag names; a YAML file can ask for a name that no folder can have."""
+    if not text or "\0" in text:
         raise UsageError(f"--{flag}={text[:40]}: expects a folder")
     try:
-        return paths.expanded(text)
+        path = paths.expanded(text)
+        os.path.abspath(path).encode()
+    except UnicodeEncodeError:  # Orbax could not write checkpoints there
+        raise UsageError(f"--{flag}={text[:40]}: expects a folder whose whole path is UTF-8") from None
     except ValueError as error:
         raise UsageError(f"--{flag}={text[:40]}: {error}") from None
+    return path
 
 
 def _reject_duplicates(name: str, values: Sequence[Any]) -> None:

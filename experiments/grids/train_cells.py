@@ -34,7 +34,7 @@ def train_in_process(cell: GridCell) -> int:
 
         before = {number: signal.signal(number, forward) for number in (signal.SIGTERM, *announcements())}
         try:
-            process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True)
+            process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True, errors="replace")
             if stopped:  # before the process existed
                 process.terminate()
             while True:

@@ -21,6 +21,7 @@ from sqt_jax.rollout import Policy
 SIZE = (640, 480)
 
 
+@jax_settings.needed_switches()
 def perform(run: Path, options: argparse.Namespace) -> None:
     """Plays episodes of one member, prints their returns, and films or shows them.
 

@@ -97,11 +97,14 @@ def check(run: Path, options: argparse.Namespace) -> None:
 
 
 def choose_graphics(run: Path, options: argparse.Namespace) -> None:
-    """Sets MUJOCO_GL for a film of a MuJoCo model. Call before MuJoCo is imported, which reads it then.
+    """Sets MUJOCO_GL for a film of a MuJoCo model, or for none. Call before MuJoCo is imported, which reads it then.
 
     Raises:
       UsageError: no OpenGL implementation works.
     """
+    if options.video is None:  # MuJoCo rejects an unknown value
+        os.environ.pop("MUJOCO_GL", None)
+        os.environ |= {} if graphics.has_display() else {"MUJOCO_GL": "disable"}
     if options.video is None or is_brax(_setting(run, "env")):
         return
     try:

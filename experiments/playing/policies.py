@@ -122,7 +122,7 @@ def load(path: Path, chosen: Chosen, env: Environment, best: bool = False) -> Lo
 
     try:
         (policy, sizes, origin), found = read_first(path, best, read)
-    except (FileNotFoundError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise UsageError(str(error)) from None
     if sizes != (env.observation_size, env.action_size):
         raise UsageError(f"{found.path}: is not a policy for {env.name}: its sizes are {sizes[0]} and {sizes[1]}")

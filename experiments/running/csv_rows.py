@@ -5,6 +5,7 @@ import errno
 import io
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,8 @@ class CsvTable:
             if written < len(self._waiting):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError:
-            os.ftruncate(self._file, self._size)  # no partial rows
+            with suppress(OSError):
+                os.ftruncate(self._file, self._size)  # no partial rows
             return False
         self._size += written
         self._waiting = b""

@@ -71,7 +71,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     _check_env(options, env)
     folder_given = options.resume not in (None, flags.LATEST)
     target = _from_folder(options, env) if folder_given else _from_settings(options, env)
-    if target.resumed is None:
+    if target.resumed is None and options.name is not None:  # without one, the run gets a folder of its own
         try:
             if options.overwrite:
                 records.removable_files(target.path)

@@ -131,6 +131,7 @@ class Records:
         self._evaluations = CsvTable(path / "evaluations.csv", lengths.get("evaluations", 0), columns)
         # Created with the first metrics, when its columns are known.
         self._metrics: CsvTable | None = None
+        self._metric_rows: list[dict[str, Any]] = []  # of the time before it could be created
         self._keep_metrics = lengths.get("metrics", 0)
         if not self._keep_metrics:
             (path / "metrics.csv").unlink(missing_ok=True)
@@ -166,12 +167,6 @@ class Records:
 
         If the disk is full, `warn` is called once; rows wait in memory, and TensorBoard events end.
         """
-        if report.metrics and self._metrics is None:
-            columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *report.metrics]
-            columns += bias.NAMES
-            # SAC's temperature is a metric and may be a swept setting, of the same value.
-            columns = [*dict.fromkeys(columns), "wall_seconds"]
-            self._metrics = CsvTable(self.path / "metrics.csv", self._keep_metrics, columns)
         written = True
         for index, member in enumerate(self.members):
             metrics = {name: float(values[index]) for name, values in report.metrics.items()}
@@ -197,8 +192,8 @@ class Records:
                 measured = {name: metrics.get(name, math.nan) if valid else math.nan for name in ("q_mean", "q_std")}
                 evaluation["value_bias"] = bias_metrics.get("value_bias", math.nan)
                 written &= self._evaluations.write(row | evaluation | measured)
-            if self._metrics and report.metrics:
-                written &= self._metrics.write(row | metrics | bias_metrics)
+            if report.metrics:
+                self._metric_rows.append(row | metrics | bias_metrics)
             if self._events:
                 values = {f"eval/{name}": value for name, value in evaluation.items()}
                 values |= {f"train/{name}": value for name, value in metrics.items()}
@@ -207,9 +202,27 @@ class Records:
                 except OSError as error:
                     self._events = []
                     self.warn(f"no more events for TensorBoard: {error.strerror}")
+        written &= self._write_metric_rows([*report.metrics])
         if not written and not self._disk_full:
             self.warn("the disk has no room for rows of evaluations.csv and metrics.csv: they are kept until it has")
         self._disk_full = not written
+
+    def _write_metric_rows(self, metrics: Sequence[str]) -> bool:
+        """Writes the rows that wait for metrics.csv, and creates it if need be; returns whether all are in the file.
+
+        Args:
+          metrics: the names of the metrics.
+        """
+        try:
+            if self._metrics is None and self._metric_rows:
+                columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *metrics]
+                # SAC's temperature is a metric and may be a swept setting, of the same value.
+                columns = [*dict.fromkeys([*columns, *bias.NAMES]), "wall_seconds"]
+                self._metrics = CsvTable(self.path / "metrics.csv", self._keep_metrics, columns)
+        except OSError:  # the rows are tried again with the next ones
+            return False
+        rows, self._metric_rows = self._metric_rows, []
+        return all([self._metrics.write(row) for row in rows]) if self._metrics else True
 
     def summary(self, outcome: Outcome) -> dict[str, Any]:
         """Writes summary.json and returns its content."""

@@ -19,7 +19,6 @@ from experiments.commandline.arguments import (
     printable,
 )
 from experiments.commandline.flags import Options
-from experiments.evidence import figures
 from experiments.running import files, manifests, records, resume, run_config
 from experiments.running.announce import Announcer
 from experiments.running.checkpoints import CheckpointStore, Restored
@@ -107,14 +106,7 @@ class Session:
             state_bytes, row_bytes = self.store.sizes(self.template)
             state_bytes += self.policies.bytes_in_checkpoint(self.template.agent)
             self.announcer.start(resumed_at, (state_bytes, row_bytes))
-            try:
-                outcome = self._train(tables, lambda: bool(received))
-            except (MemoryError, jax.errors.JaxRuntimeError) as error:
-                if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
-                    raise
-                text = f"out of memory ({_one_line(error)}): fewer --seeds or a smaller --replay_capacity need less"
-                print(printable(text), file=sys.stderr)
-                return FAILED
+            outcome = self._train(tables, lambda: bool(received))
             try:
                 curves = self._write_results(outcome)
                 summary = tables.summary(outcome)  # last: its existence says that the run has ended
@@ -267,6 +259,9 @@ class Session:
         if not len(table["member"]):
             return False
         try:
+            # Here, so that a matplotlib that cannot be imported costs a figure, not the run.
+            from experiments.evidence import figures
+
             figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
         except Exception as error:  # of any type: no fault of a figure may cost the summary
             self.display.message(f"no curves.png: {_one_line(error)}; experiments.plots draws it later")

@@ -27,7 +27,8 @@ def stop_on_signal() -> Iterator[list[int]]:
     """Collects the signals in the list that it yields; a second SIGINT or SIGTERM ends the process at once.
 
     A SIGTERM within a second of another one counts as the same: with a batch system, both the system and
-    `experiments.sweep`, which forwards its own, send one to this process. A signal that is ignored stays so (`nohup`).
+    `experiments.sweep`, which forwards its own, send one to this process. An announcement that is ignored
+    stays so (`nohup`).
     """
     received: list[int] = []
     last_sigterm = -math.inf
@@ -55,4 +56,5 @@ def stop_on_signal() -> Iterator[list[int]]:
         yield received
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if handler is not None:  # it was not installed from Python
+                signal.signal(number, handler)

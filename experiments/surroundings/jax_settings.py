@@ -2,7 +2,8 @@
 
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import jax
@@ -33,8 +34,12 @@ NEEDED = {
     "jax_no_tracing": False,
     "jax_no_execution": False,
     "jax_raise_persistent_cache_errors": False,
+    "jax_error_checking_behavior_nan": "ignore",
+    "jax_error_checking_behavior_divide": "ignore",
+    "jax_error_checking_behavior_oob": "ignore",
+    "jax_transfer_guard_host_to_device": "allow",
+    "jax_transfer_guard_device_to_host": "allow",
 }
-TRANSFERS = ("jax_transfer_guard_host_to_device", "jax_transfer_guard_device_to_host")
 # Switches that cannot be ignored, since the user asks for something else than training: what to do instead.
 REFUSED = {
     "jax_debug_nans": "a NaN here is a metric that was not measured; a member that diverges is reported without it",
@@ -43,13 +48,33 @@ REFUSED = {
 }
 
 
-def prepare() -> None:
-    """Applies the settings; call before the first computation. Except for switches, the user's variables win.
+@contextmanager
+def needed_switches() -> Iterator[None]:
+    """JAX with the switches that a run needs; afterwards they are the caller's again.
 
     Raises:
-      UsageError: a switch of JAX that a run cannot support is on.
+      UsageError: a switch is on that a run cannot support.
     """
-    _set_switches()
+    values = jax.config.values
+    for name, instead in REFUSED.items():
+        if values.get(name):
+            raise UsageError(f"{name.upper()}: expects it to be off: {instead}")
+    # None: not set, as good as allowed. A version of JAX may lack a switch.
+    before = {name: values[name] for name, needed in NEEDED.items() if values.get(name) not in (None, needed)}
+    if before:
+        names = ", ".join(map(str.upper, before))
+        print(f"{names}: has no effect on a run, which needs JAX's default", file=sys.stderr)
+    try:
+        for name in before:
+            jax.config.update(name, NEEDED[name])
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+
+
+def prepare() -> None:
+    """Applies the settings of a process; call before its first computation. The user's variables win."""
     xla_flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in xla_flags:
         option = f"--xla_backend_extra_options={SMALL_LOOPS}={SMALL_LOOP_BYTES}"
@@ -83,9 +108,10 @@ def start_jax(devices: int) -> None:
         reason = " ".join(str(error).split())[:150]
         clear_backends()
         jax.config.update("jax_platforms", "")
+        here = jax.default_backend()
+        jax.config.update("jax_platforms", wanted)
         raise UsageError(
-            f"JAX_PLATFORMS={wanted}: expects a platform of this machine, as {jax.default_backend()}"
-            + (f"; {reason}" if reason else "")
+            f"JAX_PLATFORMS={wanted}: expects a platform of this machine, as {here}" + (f"; {reason}" if reason else "")
         ) from None
 
 
@@ -122,21 +148,6 @@ def _cache() -> str | None:
     hint = "JAX_COMPILATION_CACHE_DIR names another folder"
     print(f"compiled programs are not kept for the next run: {problem}; {hint}", file=sys.stderr)
     return None
-
-
-def _set_switches() -> None:
-    for name, instead in REFUSED.items():
-        if getattr(jax.config, name):
-            raise UsageError(f"{name.upper()}: expects it to be off: {instead}")
-    changed = [name for name, needed in NEEDED.items() if getattr(jax.config, name) != needed]
-    for name in changed:
-        jax.config.update(name, NEEDED[name])
-    for name in TRANSFERS:
-        if (jax.config.values[name] or "").startswith("disallow"):
-            jax.config.update(name, "allow")
-            changed.append(name)
-    if changed:
-        print(f"{', '.join(map(str.upper, changed))}: has no effect on a run; float32, JAX's defaults", file=sys.stderr)
 
 
 def _set_cpu_device_count(devices: int) -> None:

@@ -1,13 +1,29 @@
 """Environment variables that a library would read when imported, and other inherited settings of the process."""
 
+import logging
 import os
+import re
 import resource
 import sys
 import warnings
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-NO_HOME = "/nonexistent"  # the home folder of users without one (Debian's `nobody`)
+NO_HOME = os.devnull  # no folder can be made in it, by root neither
+MANY_FILES = 65_536
+# A word of Python's own options that ends with -m, or with -mMODULE.
+MODULE_OPTION = re.compile(r"-[bBdEiIOPqsSuvx]*m(.*)")
+# Variables of JAX with any text as their value: they need no check.
+TEXTS = {"JAX_COMPILATION_CACHE_DIR", "JAX_PLATFORMS"}
+
+
+def module_of(argv: Sequence[str]) -> str:
+    """The module that `python -m MODULE` runs, from Python's own command line (`sys.orig_argv`); empty if none."""
+    for word, following in zip(argv, [*argv[1:], ""], strict=True):
+        if match := MODULE_OPTION.fullmatch(word):
+            return match[1] or following
+    return ""
 
 
 def prepare(command: str) -> None:
@@ -21,6 +37,7 @@ def prepare(command: str) -> None:
     """
     # Notebooks set a backend that needs their own packages; a user's rc file may need LaTeX.
     os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where it cannot keep its font cache
     if command != "experiments.play":  # only films need OpenGL; MuJoCo rejects an unknown value when imported
         os.environ["MUJOCO_GL"] = "disable"
     if any(option.startswith("error") for option in sys.warnoptions):
@@ -29,7 +46,7 @@ def prepare(command: str) -> None:
     if not has_home():
         os.environ["HOME"] = NO_HOME  # else libraries fail when they look for it
     _allow_many_files()
-    if any(name.startswith("JAX_") for name in os.environ):
+    if any(name.startswith("JAX_") for name in os.environ.keys() - TEXTS):
         _check_import_of_jax()
 
 
@@ -42,10 +59,12 @@ def has_home() -> bool:
 
 
 def _allow_many_files() -> None:
-    """Raises the limit of open files to what the system allows: a run has an event file per member."""
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with suppress(ValueError, OSError):  # macOS allows less than it says
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    """Raises the limit of open files: a run has an event file per member."""
+    soft, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MANY_FILES if most == resource.RLIM_INFINITY else min(MANY_FILES, most)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(ValueError, OSError):  # macOS allows less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
 
 
 def _check_import_of_jax() -> None:

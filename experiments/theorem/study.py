@@ -48,6 +48,7 @@ class StudySettings:
         return q_learning.algorithms(self.tables, self.ddof, self.greedy, self.weighted_c)
 
 
+@jax_settings.needed_switches()
 def run(settings: StudySettings, out: Path, command: str) -> None:
     """Runs the study, prints the results and writes `TABLE` and `FIGURE` into `out`.
 
