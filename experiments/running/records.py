@@ -139,7 +139,10 @@ class Records:
         self._events: list[Events] = []
         if tensorboard:
             labels = [_label(member, self.swept) for member in members]
-            self._events = [Events(path / "tensorboard" / label, purge_step) for label in labels]
+            try:
+                self._events = [Events(path / "tensorboard" / label, purge_step) for label in labels]
+            except OSError as error:  # too many open files, no fsync, ...: the tables have the same numbers
+                self.warn(f"no events for TensorBoard: {error.strerror}")
         self._disk_full = False
 
     def __enter__(self) -> "Records":
