@@ -1,14 +1,21 @@
-"""Random command lines and YAML files, up to the finished plan: a plan or one line, and nothing is written."""
+"""Random command lines and YAML files, up to the finished plan: a plan or one line, and nothing is written.
+
+The other commands: up to their checked flags.
+"""
 
 import functools
 import random
+from pathlib import Path
 
 import pytest
 import yaml
 
+from experiments import plots, report, tables
 from experiments.commandline import flags
 from experiments.commandline.arguments import UsageError, printable
 from experiments.commandline.flag_table import FLAGS
+from experiments.grids.grid import GRIDS, make_cells
+from experiments.playing import play_flags
 from experiments.running import plan
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
@@ -94,13 +101,14 @@ def run(inputs: int, seed: int, folder, monkeypatch) -> int:
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.chdir(folder)
     monkeypatch.setattr(envs, "make", functools.cache(envs.make))
-    monkeypatch.setattr(plan, "memory_estimate", functools.cache(lambda config, members, env: 0))
+    estimate = functools.cache(plan.memory_estimate)
+    monkeypatch.setattr(plan, "memory_estimate", estimate)
     draw, planned = random.Random(seed), 0
     for _ in range(inputs):
         argv = command_line(draw, folder)
         try:
             options = flags.parse(argv)
-            planned += options is not None and plan.make_plan(options) is not None
+            planned += options is not None and bool(plan.make_plan(options).members)
         except UsageError as error:
             text = printable(str(error))
             assert text and "\n" not in text and len(text) < 12_000, argv
@@ -112,6 +120,47 @@ def run(inputs: int, seed: int, folder, monkeypatch) -> int:
 
 def test_a_few_random_command_lines(tmp_path, monkeypatch):
     assert run(200, 1, tmp_path, monkeypatch) > 10
+
+
+PARSERS = {"tables": tables.parser, "plots": plots.parser, "report": report.parser, "play": play_flags.parser}
+
+
+@pytest.mark.parametrize("command", PARSERS)
+def test_random_words_for_commands_that_read_runs(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    draw, accepted = random.Random(command), 0
+    names = [word for action in PARSERS[command]()._actions for word in action.option_strings if word.startswith("--")]
+    for _ in range(500):
+        flag, text = (
+            draw.choice([*names, "--no", "-x"]),
+            draw.choice([*NUMBERS, *WORDS, *ODD, "a.mp4", "640x480", "png"]),
+        )
+        words = [".", *draw.choice([[], [flag], [f"{flag}={text}"], [flag, text], [text, f"{flag}={text}"]])]
+        try:
+            options = PARSERS[command]().read([command, *words])
+            if command == "play":
+                play_flags.check(Path(options.runs[0]), options)
+            accepted += 1
+        except UsageError as error:
+            assert str(error) and "\n" not in printable(str(error)), words
+        except SystemExit as left:  # --help
+            assert left.code == 0
+        except BaseException as error:
+            raise AssertionError(words) from error
+    assert accepted > 20 and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_random_words_for_a_sweep(seed, tmp_path):
+    draw = random.Random(seed)
+    grid = draw.choice([*GRIDS, *GRIDS, *WORDS, *ODD, None])
+    algos, tasks = ([draw.choice([*ALGORITHMS, "", "\0"]) for _ in range(draw.randint(0, 2))] for _ in range(2))
+    words = [f"--{name}={text}" for name, text in settings(draw).items()]
+    try:
+        make_cells(grid, algos, tasks, tmp_path, words)
+    except UsageError as error:
+        assert str(error) and "\n" not in printable(str(error)), (grid, words)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
