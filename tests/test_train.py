@@ -219,7 +219,8 @@ def test_coef_0_trains_bit_identically_to_the_baseline_and_others_do_not(algo):
         config, _, sweep = make(name, probe_envs.constant_reward)
         state, _ = advance(sweep, start(config, sweep, penalty_coef=[coef] * 3), 40, False)
         state, _ = advance(sweep, state, 60, True)
-        trained[name, coef] = (state.agent.actor, state.agent.critic)
+        learner = getattr(state.agent, "learner", state.agent)  # TD7's is inside its policy checkpoints
+        trained[name, coef] = (learner.actor, learner.critic)
     assert identical(trained[plain, 0.0], trained[algo, 0.0])
     assert not identical(trained[plain, 0.0], trained[algo, 0.5])
 

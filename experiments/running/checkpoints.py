@@ -5,6 +5,8 @@ rows never change, so each checkpoint writes only the rows since the last one, f
 the other arrays, and the caller further files.
 """
 
+import errno
+import os
 import shutil
 import threading
 import zlib
@@ -26,6 +28,7 @@ from sqt_jax.train import TrainState, member_axes
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Array, Replay, State
 
+SPARE_BYTES = 1_000_000  # to be free in addition to a checkpoint
 PIECE_BYTES = 64_000_000  # of replay rows on the host at a time
 
 
@@ -182,6 +185,9 @@ class CheckpointStore:
         part = self.path / f"{step.name}.part"
         try:
             _remove(part)
+            # Before Orbax, whose threads print tracebacks when they meet a full disk.
+            if shutil.disk_usage(self.path).free < 2 * sum(array.nbytes for array in arrays.values()) + SPARE_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             _orbax().save(part.absolute() / "state", arrays)
             write_more(part)
             written = manifests.files_of(part)
