@@ -48,7 +48,7 @@ RUN = "runs/hopper/td3/run"
 BRAX = "runs/brax:inverted_pendulum/td3/run"
 OWN = "runs/cheetah/td3/run"
 BY_PYTHON = (
-    f"{OWN}: expects a run on one of the library's environments; this one's was handed in from Python: there, use "
+    f"{OWN}: expects --env=MODULE:FUNCTION, a function that returns its own environment; or in Python: "
     f"sqt_jax.load_policy('{OWN}') and sqt_jax.evaluate_policy(policy, env)"
 )
 
