@@ -54,7 +54,7 @@ def test_it_is_resumed_with_the_environment_and_ends_as_without_a_break(out, poi
 @pytest.mark.parametrize(
     ("env", "reason"),
     [
-        (None, "expects the environment 'my point/v0' handed in: run.main(argv, env=...)"),
+        (None, "expects the environment 'my point/v0', by --env=MODULE:FUNCTION or run.main(argv, env=...)"),
         ({"name": "other"}, "expects the run's own settings; these differ: env (its own: my point/v0, now: other)"),
         ({"observation_size": 3}, "these differ: observation_size (its own: 2, now: 3)"),
     ],

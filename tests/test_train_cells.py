@@ -64,7 +64,7 @@ def test_the_errors_of_a_run_that_failed_are_printed(child, capfd, code, printed
         (signal.SIGTERM, "trap 'exit 0' TERM"),
         (signal.SIGTERM, ""),
         (signal.SIGUSR1, "trap 'exit 130' USR1"),
-        (signal.SIGHUP, ""),
+        (signal.SIGUSR2, ""),
     ],
     ids=["saved", "ended", "killed", "announced", "hung up"],
 )
