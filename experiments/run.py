@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax
 
 from experiments.commandline import flag_table, flags
-from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError, printable
+from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError, one_line, printable
 from experiments.surroundings import jax_settings
 from sqt_jax.envs import factories
 from sqt_jax.types import Environment
@@ -46,11 +46,10 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         advice = (
             "fewer --seeds or a smaller --replay_capacity need less, and --resume continues from the last checkpoint"
         )
-        print(printable(f"out of memory ({text}): {advice}"), file=sys.stderr)
+        print(printable(f"out of memory ({one_line(error)}): {advice}"), file=sys.stderr)
         return FAILED
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)

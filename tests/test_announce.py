@@ -71,3 +71,19 @@ def test_an_interrupted_run_ends_with_the_command_that_resumes_it(console, tmp_p
         f"curves: {path / 'curves.png'}",
         f"resume with: python -m experiments.run --resume='{path}'",
     ]
+
+
+@pytest.mark.parametrize(
+    ("env", "command"),
+    [
+        ("my_tasks:make", "python -m experiments.run --resume=a --env=my_tasks:make"),
+        ("point", "experiments.run.main(['run', '--resume=a'], env=env)"),  # handed in, and named
+        (None, "experiments.run.main(['run', '--resume=a'], env=env)"),
+    ],
+)
+def test_a_run_on_ones_own_environment_is_resumed_with_it(console, env, command):
+    options = SimpleNamespace(quiet=False, env=env)
+    plan = SimpleNamespace(path="a", own_env=object(), output={"checkpoint_every": 20}, options=options)
+    outcome = SimpleNamespace(interrupted=True, wall_seconds=83.0, steps_per_second=None)
+    Announcer(console, plan).end(outcome, SUMMARY, [], curves=False)
+    assert console.file.getvalue().splitlines()[-1] == f"resume with: {command}"

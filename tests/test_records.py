@@ -1,13 +1,14 @@
 """The tables, summary and events of a run."""
 
 import csv
+import errno
 import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.running import records
+from experiments.running import csv_rows, records
 from experiments.running.loop import Outcome, Report
 from experiments.running.records import (
     EVALUATION_COLUMNS,
@@ -93,6 +94,28 @@ def test_other_swept_scalars_are_further_columns(tmp_path):
     header = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[0].split(",")
     assert header[:6] == ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", "temperature"]
     assert header.count("temperature") == 1 and header[-1] == "wall_seconds"
+
+
+def test_rows_wait_where_metrics_csv_cannot_be_created_and_no_checkpoint_misses_them(tmp_path, monkeypatch):
+    """A full disk at the first metrics: the run continues, and a checkpoint would not have these rows."""
+    made, warnings = csv_rows.CsvTable, []
+
+    def full(path, *arguments):
+        if path.name == "metrics.csv":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return made(path, *arguments)
+
+    with Records(tmp_path / "run", members_of(), [], tensorboard=False, warn=warnings.append) as written:
+        monkeypatch.setattr(records, "CsvTable", full)
+        written.report(report(10, [[2.0], [6.0]], {"q_std": [0.25, 0.5]}))
+        assert len(warnings) == 1 and not (tmp_path / "run" / "metrics.csv").exists()
+        with pytest.raises(OSError, match="No space left"):
+            written.lengths()
+        monkeypatch.setattr(records, "CsvTable", made)
+        assert written.lengths()["metrics"] == (tmp_path / "run" / "metrics.csv").stat().st_size > 0
+        written.report(report(20, [[3.0], [7.0]], {"q_std": [0.25, 0.5]}))
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        assert [row["env_steps"] for row in csv.DictReader(file)] == ["10", "10", "20", "20"]
 
 
 def test_an_interval_without_an_evaluation_is_a_row_of_metrics_only(tmp_path):

@@ -99,6 +99,21 @@ def test_a_run_on_an_environment_from_python_is_repeated_in_python(tmp_path):
     assert not {"physics", "eval_physics"} & {setting.name for setting in found.settings}
 
 
+@pytest.mark.parametrize(
+    ("words", "shell"),
+    [
+        (["--env=my_tasks:make", "--algo=td3"], True),
+        (["--env", "my_tasks:make"], True),
+        (["--algo=td3", "--name=a:b"], False),
+        (["--env=point"], False),
+    ],
+)
+def test_a_run_on_a_function_of_a_module_is_repeated_from_the_shell(tmp_path, words, shell):
+    path = write_run(tmp_path, env="point", sizes=(3, 2), steps=60)
+    (found, *_) = details(path, command=["", *words]).commands
+    assert found.text.startswith("python -m experiments.run" if shell else "experiments.run.main([")
+
+
 def test_an_environment_has_the_name_that_it_has_in_the_tables(tmp_path):
     write_run(tmp_path, env="point", name="a", sizes=(1, 1))
     write_run(tmp_path, env="point", name="b", sizes=(3, 2))

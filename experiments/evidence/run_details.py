@@ -182,10 +182,17 @@ def _command(entry: Mapping[str, Any], label: str, own_env: bool) -> Command:
     note = ""
     if any(word.lstrip("-").partition("=")[0] == "config" for word in words[1:]):
         note = "It read flags from a file that is not recorded; the resulting settings are below."
-    if own_env and not any(is_factory(word.partition("=")[2] or word) for word in words[1:]):
+    if own_env and not _names_factory(words):
         label = f"{label} (in Python; env is the environment that was handed in)"
         return Command(f"experiments.run.main({['run', *words[1:]]!r}, env=env)", label, note)
     return Command(shlex.join(["python", "-m", "experiments.run", *words[1:]]), label, note)
+
+
+def _names_factory(words: Sequence[str]) -> bool:
+    """Whether a command line has `--env=module:function`, as one word or as two."""
+    pairs = zip(words, [*words[1:], ""], strict=True)
+    values = [word.partition("=")[2] or after for word, after in pairs if word.lstrip("-").partition("=")[0] == "env"]
+    return any(map(is_factory, values))
 
 
 def _returns(member: MemberCurves, swept: Sequence[str]) -> MemberReturns:

@@ -13,6 +13,7 @@ from experiments.running.loop import Outcome
 from experiments.running.plan import Plan
 from experiments.running.progress import format_seconds
 from sqt_jax import envs
+from sqt_jax.envs.factories import is_factory
 from sqt_jax.envs.gym_tasks import EPISODE_LENGTH
 from sqt_jax.experiment import agent_of
 from sqt_jax.train import evaluation_steps
@@ -80,7 +81,7 @@ class Announcer:
             self._line(f"curves: {self.plan.path / 'curves.png'}")
         if outcome.interrupted and self.plan.output["checkpoint_every"]:
             command = f"python -m experiments.run --resume={shlex.quote(str(self.plan.path))}"
-            if self.plan.own_env and self.plan.options.env:
+            if self.plan.own_env and is_factory(self.plan.options.env or ""):
                 command += f" --env={self.plan.options.env}"
             elif self.plan.own_env:
                 command = f"experiments.run.main(['run', {f'--resume={self.plan.path}'!r}], env=env)"

@@ -118,7 +118,7 @@ def _check_env(options: flags.Options, env: Environment | None) -> None:
         return
     if not isinstance(env, Environment):
         raise UsageError(f"env: expects an Environment (sqt_jax.make_environment), not a {type(env).__name__}")
-    if options.env not in (None, env.name) and not is_factory(str(options.env)):
+    if options.env not in (None, env.name) and not is_factory(options.env or ""):
         raise UsageError(
             f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
         )

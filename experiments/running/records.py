@@ -2,8 +2,10 @@
 
 import contextlib
 import csv
+import errno
 import json
 import math
+import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -162,6 +164,8 @@ class Records:
         Raises:
           OSError: the disk has no room for them.
         """
+        if not self._write_metric_rows():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "metrics.csv")
         metrics = self._metrics.length() if self._metrics else self._keep_metrics
         return {"evaluations": self._evaluations.length(), "metrics": metrics}
 
@@ -205,22 +209,17 @@ class Records:
                 except OSError as error:
                     self._events = []
                     self.warn(f"no more events for TensorBoard: {error.strerror}")
-        written &= self._write_metric_rows([*report.metrics])
+        written &= self._write_metric_rows()
         if not written and not self._disk_full:
             self.warn("the disk has no room for rows of evaluations.csv and metrics.csv: they are kept until it has")
         self._disk_full = not written
 
-    def _write_metric_rows(self, metrics: Sequence[str]) -> bool:
-        """Writes the rows that wait for metrics.csv, and creates it if need be; returns whether all are in the file.
-
-        Args:
-          metrics: the names of the metrics.
-        """
+    def _write_metric_rows(self) -> bool:
+        """Writes the rows that wait for metrics.csv, and creates it with the first; returns whether all are written."""
         try:
             if self._metrics is None and self._metric_rows:
-                columns = ["member", "env_steps", "gradient_steps", "seed", "penalty_coef", *self.swept, *metrics]
-                # SAC's temperature is a metric and may be a swept setting, of the same value.
-                columns = [*dict.fromkeys([*columns, *bias.NAMES]), "wall_seconds"]
+                first = [name for name in self._metric_rows[0] if name != "wall_seconds"]
+                columns = [*dict.fromkeys([*first, *bias.NAMES]), "wall_seconds"]
                 self._metrics = CsvTable(self.path / "metrics.csv", self._keep_metrics, columns)
         except OSError:  # the rows are tried again with the next ones
             return False

@@ -16,6 +16,7 @@ from experiments.commandline.arguments import (
     FAILED,
     INTERRUPTED,
     UsageError,
+    one_line,
     printable,
 )
 from experiments.commandline.flags import Options
@@ -264,7 +265,7 @@ class Session:
 
             figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
         except Exception as error:  # of any type: no fault of a figure may cost the summary
-            self.display.message(f"no curves.png: {_one_line(error)}; experiments.plots draws it later")
+            self.display.message(f"no curves.png: {one_line(error)}; experiments.plots draws it later")
             return False
         return True
 
@@ -280,7 +281,3 @@ def _init_arguments(members: Sequence[Member]) -> tuple[Array, Scalars]:
     agents = [member.config.agent for member in members]
     scalars = (jnp.array([getattr(agent, name) for agent in agents], jnp.float32) for name in Scalars._fields)
     return jax.vmap(jax.random.key)(seeds), Scalars(*scalars)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]

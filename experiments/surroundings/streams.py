@@ -5,7 +5,7 @@ import io
 import os
 import select
 import sys
-from typing import TextIO
+from typing import Any, TextIO
 
 _lost: dict[int, OSError] = {}  # file descriptor -> why its last output was lost
 
@@ -13,8 +13,8 @@ _lost: dict[int, OSError] = {}  # file descriptor -> why its last output was los
 class _Lenient(io.FileIO):
     """A file that drops what it cannot write."""
 
-    def write(self, data: object) -> int:
-        content = memoryview(data)  # type: ignore[arg-type]
+    def write(self, data: Any) -> int:
+        content = memoryview(data)
         try:
             written = super().write(content)
             while written is None:  # the stream does not block, and its reader is slow
@@ -49,12 +49,10 @@ def lost_output() -> str | None:
 
 def _guarded(descriptor: int, stream: TextIO | None) -> io.TextIOWrapper:
     interactive = os.isatty(descriptor)
-    made = io.TextIOWrapper(
+    return io.TextIOWrapper(
         io.BufferedWriter(_Lenient(descriptor, "w", closefd=False)),
         encoding=getattr(stream, "encoding", None) or "utf-8",
         errors="backslashreplace",
         line_buffering=interactive or descriptor == 2,
         write_through=getattr(stream, "write_through", False),  # PYTHONUNBUFFERED
     )
-    made.mode = "w"  # type: ignore[misc]
-    return made
