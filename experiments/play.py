@@ -14,8 +14,8 @@ def command(argv: Sequence[str]) -> None:
     options = parser().read(argv)
     run = Path(options.runs[0])
     play_flags.check(run, options)
-    play_flags.choose_graphics(run, options)
-    from experiments.playing.performance import perform  # JAX, and MuJoCo, which reads MUJOCO_GL when imported
+    with play_flags.chosen_graphics(run, options):
+        from experiments.playing.performance import perform  # JAX, and MuJoCo, which reads MUJOCO_GL when imported
 
     perform(run, options)
 

@@ -1,6 +1,7 @@
 """The flags of the command that plays a policy are checked without JAX and MuJoCo."""
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -35,20 +36,26 @@ def options(folder, *flags):
     return play_flags.parser().read(["play", str(folder), *flags])
 
 
-def test_a_film_of_a_mujoco_model_sets_mujoco_gl(tmp_path, monkeypatch):
+@pytest.mark.parametrize("before", ["other", None])
+@pytest.mark.parametrize(
+    ("env", "display", "flags", "value"),
+    [
+        ("ant", True, [], ""),
+        ("ant", False, [], "disable"),
+        ("brax:ant", False, ["--video=film.html"], "disable"),  # Brax's viewer
+        ("ant", False, ["--video=film.html"], "osmesa"),
+    ],
+)
+def test_mujoco_gl_is_set_while_mujoco_is_imported(tmp_path, monkeypatch, env, display, flags, value, before):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if before:
+        monkeypatch.setenv("MUJOCO_GL", before)
     monkeypatch.setattr(graphics, "choose", lambda: "osmesa")
-    monkeypatch.setenv("MUJOCO_GL", "other")
-    for display, value in ((True, None), (False, "disable")):  # no film
-        monkeypatch.setattr(graphics, "has_display", lambda display=display: display)
-        play_flags.choose_graphics(tmp_path, options(tmp_path))
-        assert os.environ.get("MUJOCO_GL") == value
-    monkeypatch.setenv("MUJOCO_GL", "other")
-    (tmp_path / "config.json").write_text('{"settings": {"env": "brax:ant"}}')
-    play_flags.choose_graphics(tmp_path, options(tmp_path, "--video=film.html"))
-    assert os.environ["MUJOCO_GL"] == "other"  # Brax's viewer
-    (tmp_path / "config.json").write_text('{"settings": {"env": "ant"}}')
-    play_flags.choose_graphics(tmp_path, options(tmp_path, "--video=film.html"))
-    assert os.environ["MUJOCO_GL"] == "osmesa"
+    monkeypatch.setattr(graphics, "has_display", lambda: display)
+    (tmp_path / "config.json").write_text(json.dumps({"settings": {"env": env}}))
+    with play_flags.chosen_graphics(tmp_path, options(tmp_path, *flags)):
+        assert os.environ["MUJOCO_GL"] == value
+    assert os.environ.get("MUJOCO_GL") == before
 
 
 def test_a_damaged_config_is_left_to_the_reader_of_runs(tmp_path):

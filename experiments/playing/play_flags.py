@@ -2,6 +2,8 @@
 
 import argparse
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from experiments.commandline import arguments
@@ -96,21 +98,33 @@ def check(run: Path, options: argparse.Namespace) -> None:
             raise UsageError(f"--size: Brax's viewer has its own; expects no size with {name}")
 
 
-def choose_graphics(run: Path, options: argparse.Namespace) -> None:
-    """Sets MUJOCO_GL for a film of a MuJoCo model, or for none. Call before MuJoCo is imported, which reads it then.
+@contextmanager
+def chosen_graphics(run: Path, options: argparse.Namespace) -> Iterator[None]:
+    """Sets MUJOCO_GL while MuJoCo is imported, which reads it then: an OpenGL that works for a film, or none.
+
+    Without a film the user's value is not used: MuJoCo cannot be imported with one that does not work.
 
     Raises:
       UsageError: no OpenGL implementation works.
     """
-    if options.video is None:  # MuJoCo rejects an unknown value
-        os.environ.pop("MUJOCO_GL", None)
-        os.environ |= {} if graphics.has_display() else {"MUJOCO_GL": "disable"}
-    if options.video is None or is_brax(_setting(run, "env")):
-        return
+    before = os.environ.get("MUJOCO_GL")
     try:
-        os.environ["MUJOCO_GL"] = graphics.choose()
+        os.environ["MUJOCO_GL"] = _graphics(run, options)
+        yield
     except graphics.NoGraphics as error:
         raise UsageError(f"--video={options.video}: {error}") from None
+    finally:
+        if before is None:
+            os.environ.pop("MUJOCO_GL", None)
+        else:
+            os.environ["MUJOCO_GL"] = before
+
+
+def _graphics(run: Path, options: argparse.Namespace) -> str:
+    """A value of MUJOCO_GL; empty is MuJoCo's own choice."""
+    if options.video is None or is_brax(_setting(run, "env")):
+        return "" if graphics.has_display() else "disable"
+    return graphics.choose()
 
 
 def is_brax(name: str) -> bool:
