@@ -2,22 +2,36 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 import jax
 
 from experiments.commandline import flag_table, flags
-from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError, one_line, printable
+from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError, printable
+from experiments.running import run_config
 from experiments.surroundings import jax_settings
-from sqt_jax.envs import factories
+from sqt_jax.envs import env_args, factories
+from sqt_jax.one_line import one_line
 from sqt_jax.types import Environment
 
 
-def own_environment(name: str | None) -> Environment | None:
-    """The environment of `--env=MODULE:FUNCTION`; None if `name` has another form. Raises `UsageError`."""
-    if name is None or not factories.is_factory(name):
+def own_environment(options: flags.Options) -> Environment | None:
+    """The environment of `--env=MODULE:FUNCTION`; None if --env has another form. Raises `UsageError`.
+
+    A resumed run calls the function as it was called before.
+    """
+    name = options.env or ""
+    if not factories.is_factory(name):
         return None
+    settings = dict(options.settings)
+    if options.resume not in (None, flags.LATEST):
+        with suppress(run_config.InvalidRunConfig):  # reported later
+            settings = run_config.read(Path(options.resume)).content["settings"] | settings
+    steps, processes = settings.get("max_episode_steps", 0), options.env_processes or 0
     try:
-        return factories.make_from(name)
+        arguments = env_args.parse(settings.get("env_args", ""))
+        return factories.make_from(name, arguments, steps, processes)
     except ValueError as error:
         raise UsageError(f"--env={name}: {error}") from error
 
@@ -38,7 +52,7 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
             return DONE
         with jax_settings.needed_switches():
             jax_settings.prepare()
-            env = env or own_environment(options.env)
+            env = env or own_environment(options)
             # Imports SciPy, TensorBoard and Orbax: a typing error is reported without waiting for them.
             from experiments.running.session import start_session
 

@@ -1,4 +1,4 @@
-"""`cond_if_any`, a conditional that does not compute its branch under `vmap` if no batch entry needs it."""
+"""Conditions that stay real branches under `vmap`: `cond_if_any` and `any_in_batch`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -54,3 +54,18 @@ def _if_any(select: Callable) -> Callable:
         return _if_any(jax.vmap(select))(predicate, old, given), jax.tree.map(lambda _: True, old)
 
     return call
+
+
+@custom_vmap
+def any_in_batch(x: Array) -> Array:
+    """Whether `x` [] bool holds for any entry of the batch that `vmap` makes: one answer for all, [] bool.
+
+    It has no axis of the batch, so a loop or a condition on it is not computed for each entry.
+    """
+    return x
+
+
+@any_in_batch.def_vmap
+def _(axis_size: int, in_batched: Any, x: Array) -> tuple[Array, bool]:
+    del axis_size
+    return any_in_batch(jnp.any(x) if in_batched[0] else x), False

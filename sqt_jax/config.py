@@ -120,6 +120,10 @@ class TrainConfig:
         return min(self.replay_capacity, self.steps) // self.num_envs * self.num_envs
 
 
+# The fields of `Config` that say what is trained on.
+ENVIRONMENT = ("env", "physics", "eval_physics", "env_args", "max_episode_steps")
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """One member's experiment without its seed. `sqt_jax.make_config` makes and checks it."""
@@ -128,12 +132,16 @@ class Config:
     env: str
     physics: str = setting("mjx", "the physics: mjx, mujoco or warp; brax:NAME has others")
     eval_physics: str = setting("auto", "the same for evaluation; auto: mujoco on a CPU, else the training's")
+    env_args: str = setting("", "keyword arguments of gym:ID, playground:NAME or MODULE:FUNCTION: NAME=VALUE,...")
+    max_episode_steps: int = setting(
+        0, "time limit of an episode of gym:ID, playground:NAME or MODULE:FUNCTION; 0: the environment's own", low=0
+    )
     agent: AgentConfig = AgentConfig()
     train: TrainConfig = TrainConfig()
 
     def flat(self) -> dict[str, Any]:
         """All settings by name, without nesting: as in config.json and for `make_config`."""
-        own = {"algo": self.algo, "env": self.env, "physics": self.physics, "eval_physics": self.eval_physics}
+        own = {"algo": self.algo} | {name: getattr(self, name) for name in ENVIRONMENT}
         return own | dataclasses.asdict(self.agent) | dataclasses.asdict(self.train)
 
 

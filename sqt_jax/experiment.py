@@ -9,6 +9,7 @@ import jax
 from sqt_jax import envs, lap, replay, train
 from sqt_jax.algorithms import ALGORITHMS, make_agent_config, make_parts, reject_unknown
 from sqt_jax.config import SETTINGS, AgentConfig, Config, TrainConfig, check_train
+from sqt_jax.envs import env_args
 from sqt_jax.ring import Ring
 from sqt_jax.settings import ConfigError, current_names, settings_of
 from sqt_jax.suggestions import expects_one_of
@@ -24,13 +25,16 @@ def make_config(algo: str, env: str | Environment, **settings: Any) -> Config:
       algo: a name of `ALGORITHMS`.
       env: a name that `sqt_jax.make_env` knows, or an environment of your own, whose name is recorded
         with `physics="own"`.
-      **settings: fields of `AgentConfig` and `TrainConfig` by name, `physics` and `eval_physics`.
+      **settings: fields of `AgentConfig` and `TrainConfig` by name, `physics`, `eval_physics`, `env_args` and
+        `max_episode_steps`.
 
     Raises:
       ConfigError: an unknown name or an invalid value; the message names the setting and what it expects.
     """
     settings = current_names(settings, SETTINGS)
     physics, eval_physics = settings.pop("physics", None), settings.pop("eval_physics", "auto")
+    given = settings.keys() & {"env_args", "max_episode_steps"}
+    arguments: dict[str, Any] = {name: settings.pop(name) for name in given}
     training = {name: settings.pop(name) for name in settings_of(TrainConfig).keys() & settings.keys()}
     if algo in ALGORITHMS:
         reject_unknown(settings, settings_of(AgentConfig) | settings_of(TrainConfig))
@@ -40,7 +44,28 @@ def make_config(algo: str, env: str | Environment, **settings: Any) -> Config:
     check_train(train_config)
     if "checkpoints" in ALGORITHMS[algo].features and train_config.num_envs > 1:
         raise ConfigError("num_envs", f"expects 1 for {algo}, which assesses its policies one episode after another")
-    return Config(algo=algo, env=env, physics=physics, eval_physics=eval_physics, agent=agent, train=train_config)
+    _check_arguments(env, physics, arguments)
+    return Config(
+        algo=algo,
+        env=env,
+        physics=physics,
+        eval_physics=eval_physics,
+        **arguments,
+        agent=agent,
+        train=train_config,
+    )
+
+
+def _check_arguments(env: str, physics: str, arguments: dict[str, Any]) -> None:
+    """Raises ConfigError if the environment takes no `env_args` or `max_episode_steps`, or not these."""
+    for name, value in arguments.items():
+        SETTINGS[name].check(value)
+        if value and physics != OWN_PHYSICS and not envs.takes_arguments(env):
+            raise ConfigError(name, f"has no effect with {env}")
+    try:
+        env_args.parse(arguments.get("env_args", ""))
+    except ValueError as error:
+        raise ConfigError("env_args", str(error)) from None
 
 
 def _check_env(env: str | Environment, physics: str | None, eval_physics: str) -> tuple[str, str, str]:
@@ -101,7 +126,23 @@ def env_of(config: Config, env: Environment | None = None) -> Environment:
     if config.physics == OWN_PHYSICS and (env is None or env.name != config.env):
         given = "none" if env is None else env.name
         raise ValueError(f"the configuration is of an environment of your own called {config.env}, given: {given}")
-    return env or envs.make(config.env, config.physics)
+    return env or named_env(config, config.physics)
+
+
+def named_env(config: Config, physics: str, processes: int = 0) -> Environment:
+    """The environment that a configuration names.
+
+    Args:
+      processes: of environments on the host (`envs.host`), the processes that share them.
+
+    Raises:
+      ValueError: as `envs.make`.
+    """
+    options: dict[str, Any] = {}
+    if envs.takes_arguments(config.env):
+        options = {"arguments": env_args.parse(config.env_args), "max_episode_steps": config.max_episode_steps}
+        options |= {"processes": processes} if processes else {}
+    return envs.make(config.env, physics, **options)
 
 
 def agent_of(config: Config, env: Environment) -> Agent:
@@ -134,8 +175,12 @@ def make_trainer(config: Config, env: Environment | None = None) -> train.Traine
     """
     training_env = env_of(config, env)
     physics = eval_physics_of(config)
-    same = env is not None or physics == config.physics
-    eval_env = training_env if same else envs.make(config.env, physics)
+    if training_env.host:
+        eval_env = training_env.host.separate()
+    elif env is not None or physics == config.physics:
+        eval_env = training_env
+    else:
+        eval_env = named_env(config, physics)
     buffer = replay_of(config, training_env)
     return train.make_trainer(agent_of(config, training_env), training_env, buffer, config.train, eval_env)
 

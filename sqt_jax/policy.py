@@ -23,6 +23,7 @@ from sqt_jax import policy_folders
 from sqt_jax.algorithms import make_parts
 from sqt_jax.config import Config
 from sqt_jax.experiment import agent_of, make_config
+from sqt_jax.one_line import one_line
 from sqt_jax.trees import by_path, from_paths
 from sqt_jax.types import Agent, Array, Environment, State
 
@@ -168,7 +169,7 @@ def _read_config(path: Path) -> tuple[Config, tuple[int, int]]:
     except FileNotFoundError:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError, OSError) as error:
-        raise ValueError(f"{path}: not the settings of a policy: {_one_line(error)}") from None
+        raise ValueError(f"{path}: not the settings of a policy: {one_line(error)}") from None
 
 
 def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] | None:
@@ -200,12 +201,7 @@ def _read_arrays(path: Path, expected: dict[str, Any]) -> dict[str, np.ndarray] 
     except FileNotFoundError:  # removed just now
         raise FileNotFoundError(f"{path}: there is no such file") from None
     except Exception as error:  # of any type: zipfile and NumPy raise many for a file that is damaged
-        raise ValueError(f"{path}: not the parameters of a policy: {_one_line(error)}") from None
-
-
-def _one_line(error: Exception) -> str:
-    """Type and message of an error on one line, at most 300 characters."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+        raise ValueError(f"{path}: not the parameters of a policy: {one_line(error)}") from None
 
 
 def _shapes(agent: Agent) -> Any:

@@ -46,6 +46,12 @@ class Episodes(NamedTuple):
         )
         return episodes, total
 
+    def forget_running(self) -> "Episodes":
+        """Begin the running episodes again; the sums over ended ones stay."""
+        return self._replace(
+            running_return=jnp.zeros_like(self.running_return), running_length=jnp.zeros_like(self.running_length)
+        )
+
     def forget_ended(self) -> "Episodes":
         """Reset the sums over ended episodes; the running ones continue."""
         # Three arrays, not one used three times: a buffer can be donated only once.

@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 
 from sqt_jax import rollout
+from sqt_jax.conditional import any_in_batch
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation, evaluate_with_bias
 from sqt_jax.members import Layout, every_leaf
-from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep
+from sqt_jax.types import Agent, Array, Environment, Metrics, Replay, Scalars, State, TimeStep, Transition
 
 TRAINING, EVALUATION = 0, 1  # folded into a member's key, so that the two streams of numbers differ
 
@@ -67,6 +68,7 @@ class Trainer(NamedTuple):
     advance: Callable[[TrainState, Any, Any], TrainState]  # (state, num_steps, learn)
     evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]  # with the bias of the critics' values
     measure: Callable[[TrainState], Metrics]  # means over the interval, and the status at its end
+    restart: Callable[[TrainState], TrainState]  # a restored state -> the state to continue with
     member_axes: TrainState  # prefix tree of `vmap` axes of a state
 
 
@@ -80,6 +82,7 @@ class Sweep(NamedTuple):
     advance: Callable[[TrainState, int, bool], TrainState]  # donates the state
     evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]
     measure: Callable[[TrainState], Metrics]
+    restart: Callable[[TrainState], TrainState]
 
 
 def new_interval(state: TrainState) -> TrainState:
@@ -128,6 +131,27 @@ def make_trainer(
             return jnp.where(learn, agent.act(state.agent, obs, act_key), uniform)
 
         timestep, transition = rollout.step(env, state.timestep, behaviour)
+
+        if env.host is None:
+            return learn_from(state, timestep, transition, learn, update_key)
+        # Nothing of a step that failed is stored or learned: a loop of no or one iteration, because a conditional
+        # would copy the replay.
+        return jax.lax.fori_loop(
+            0,
+            jnp.where(failed(timestep), 0, 1),
+            lambda _, state: learn_from(state, timestep, transition, learn, update_key),
+            state._replace(timestep=timestep),
+        )
+
+    def failed(timestep: TimeStep) -> Array:
+        """Whether an environment of any member has failed: [] bool, one answer for all."""
+        assert env.host is not None
+        return any_in_batch(jnp.any(jax.vmap(env.host.failed)(timestep)))
+
+    def learn_from(
+        state: TrainState, timestep: TimeStep, transition: Transition, learn: Array, update_key: Array
+    ) -> TrainState:
+        """The state after a step of the environments: the transitions stored, the updates done."""
         over = timestep.terminated | timestep.truncated
         episodes, episode_return = state.episodes.add(transition.reward, over)
         # An episode that began in the warm-up has random actions in it: its return is not the policy's.
@@ -166,10 +190,24 @@ def make_trainer(
     def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> TrainState:
         """`num_steps` lockstep steps, each of E transitions; without `learn`, random actions and no updates.
 
-        Both may be traced. One call of n + m steps gives the same bits as calls of n and m steps.
+        Both may be traced. One call of n + m steps gives the same bits as calls of n and m steps. It returns earlier if
+        an environment on the host fails.
         """
         learn = jnp.asarray(learn)
-        return jax.lax.fori_loop(0, num_steps, lambda _, state: step(state, learn), state)
+        if env.host is None:
+            return jax.lax.fori_loop(0, num_steps, lambda _, state: step(state, learn), state)
+        return jax.lax.while_loop(
+            lambda carry: (carry[0] < num_steps) & ~failed(carry[1].timestep),
+            lambda carry: (carry[0] + 1, step(carry[1], learn)),
+            (jnp.zeros((), jnp.int32), state),
+        )[1]
+
+    def restart(state: TrainState) -> TrainState:
+        """A restored state, with new episodes where the environment's cannot be restored (`Environment.host`)."""
+        if env.host is None:
+            return state
+        episodes = state.episodes.forget_running()
+        return state._replace(timestep=jax.vmap(env.host.restart)(state.timestep), episodes=episodes)
 
     def evaluate_policy(state: TrainState) -> tuple[Evaluation, Metrics]:
         """Deterministic episodes from starts that training never saw, new ones at each evaluation.
@@ -216,6 +254,7 @@ def make_trainer(
         advance=advance,
         evaluate=evaluate_policy,
         measure=measure,
+        restart=restart,
         member_axes=member_axes(replay),
     )
 
@@ -241,6 +280,7 @@ def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
         advance=jax.jit(layout.over_members(trainer.advance, (axes, None, None), axes), donate_argnums=0),
         evaluate=jax.jit(layout.over_members(trainer.evaluate, (axes,), 0)),
         measure=jax.jit(layout.over_members(trainer.measure, (axes,), 0)),
+        restart=jax.jit(layout.over_members(trainer.restart, (axes,), axes), donate_argnums=0),
     )
 
 

@@ -65,6 +65,29 @@ class Environment(NamedTuple):
     min_mean_episode_length: int = 1
     # Forward speed in m/s of the step that led to this time step; None: the environment does not measure it.
     speed: Callable[[TimeStep], Array] | None = None
+    # Of an environment whose episodes are on the host, outside the compiled program (Gymnasium's); None: it is pure.
+    host: "Host | None" = None
+
+
+class HostError(NamedTuple):
+    """An exception of an environment on the host."""
+
+    text: str  # one line: its type and message
+    traceback: str
+
+
+class Host(NamedTuple):
+    """What training needs of an environment on the host (`envs.host`).
+
+    Its `reset` and `step` play the running episodes of this one object: one batch of episodes at a time, and each step
+    has to follow the newest one.
+    """
+
+    restart: Callable[[TimeStep], TimeStep]  # a saved time step -> the start of a new episode, with its key and counts
+    failed: Callable[[TimeStep], Array]  # [] bool: an environment has raised an exception, the numbers mean nothing
+    error: Callable[[], HostError | None]  # the exception, also of a separate one; None: there was none
+    separate: Callable[[], "Environment"]  # the same environment with episodes of its own
+    close: Callable[[], None]  # closes the environments and processes of all of these
 
 
 class Scalars(NamedTuple):

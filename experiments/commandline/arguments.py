@@ -190,11 +190,6 @@ def printable(text: str, kept: str = "") -> str:
     return "".join(c if c.isprintable() or c in kept else repr(c)[1:-1] for c in text)
 
 
-def one_line(error: Exception) -> str:
-    """Type and message of an error on one line, at most 200 characters."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
-
-
 def guarded(command: Callable[[Sequence[str]], Any], argv: Sequence[str]) -> int:
     """Runs a command and returns its exit code. A `UsageError` becomes one line on stderr.
 

@@ -29,6 +29,13 @@ class OutputConfig:
         low=1,
         default_text="accelerators: all that get a member; a CPU: one per member, at most 16 per core",
     )
+    env_processes: int = setting(
+        0,
+        "processes that share the environments of Gymnasium, for slow ones; without a number: one per core; 0: none, "
+        "all are stepped in this process",
+        low=0,
+        high=1000,
+    )
     tensorboard: bool = setting(True, "also write TensorBoard events")
 
 
@@ -160,8 +167,8 @@ def _flags() -> dict[str, list[Flag]]:
                 parse=str,
                 expects="a name",
                 help="environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's "
-                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own; MODULE:FUNCTION: your function that "
-                "returns a sqt_jax.Environment",
+                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own; gym:ID: any environment that Gymnasium "
+                "makes; MODULE:FUNCTION: your function that returns a sqt_jax.Environment or a gymnasium.Env",
                 default="required",
             ),
             *_group(settings_of(Config).values(), None),

@@ -19,6 +19,7 @@ from experiments.commandline.flag_table import DEFAULT_SEEDS, EXAMPLE, FLAGS, Fl
 from experiments.commandline.presets import PRESETS
 from experiments.surroundings import paths
 from sqt_jax.config import SETTINGS
+from sqt_jax.job_limits import usable_cores
 from sqt_jax.settings import ConfigError, Setting, settings_of
 from sqt_jax.suggestions import did_you_mean
 
@@ -45,6 +46,7 @@ class Options(NamedTuple):
     checkpoint_every: int | None
     keep_checkpoints: int | None
     devices: int | None
+    env_processes: int | None
     tensorboard: bool | None
     quiet: bool
 
@@ -78,7 +80,7 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
         else:
             absl_flags.DEFINE(_Parser(flag), flag.name, None, flag.help, flag_values=values)
     try:
-        rest = values(_with_resume_value(argv), known_only=False)[1:]
+        rest = values(_with_values(argv), known_only=False)[1:]
     except absl_flags.UnrecognizedFlagError as error:
         hint = did_you_mean(f"--{error.flagname}", [f"--{flag.name}" for flag in known]) or "; --help lists the flags"
         raise UsageError(f"--{error.flagname}: unknown flag{hint}") from None
@@ -95,11 +97,12 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
     return {flag.name: values[flag.name].value for flag in known if values[flag.name].present}
 
 
-def _with_resume_value(argv: Sequence[str]) -> list[str]:
-    """The words with `--resume` changed to `--resume=LATEST` where no value follows it."""
+def _with_values(argv: Sequence[str]) -> list[str]:
+    """The words with a value for `--resume` and `--env_processes` where none follows."""
+    values = {"resume": LATEST, "env_processes": str(usable_cores())}
     following = [*argv[1:], "-"]
     return [
-        f"{word}={LATEST}" if word.lstrip("-") == "resume" and word != "resume" and after.startswith("-") else word
+        f"{word}={values[name]}" if (name := word.lstrip("-")) in values and word != name and after[:1] == "-" else word
         for word, after in zip(argv, following, strict=True)
     ]
 

@@ -14,6 +14,7 @@ from experiments.running.plan import Plan
 from experiments.running.progress import format_seconds
 from sqt_jax import envs
 from sqt_jax.envs.factories import is_factory
+from sqt_jax.envs.gym_ids import module_of
 from sqt_jax.envs.gym_tasks import EPISODE_LENGTH
 from sqt_jax.experiment import agent_of
 from sqt_jax.train import evaluation_steps
@@ -46,6 +47,8 @@ class Announcer:
                 self._line(f"not the device of before, results may differ in their last digits: {', '.join(changed)}")
             if changed := resume.changed_versions(plan.resumed):
                 self._line(f"package versions differ from the run's, results may differ too: {', '.join(changed)}")
+            if plan.env.host:
+                self._line("new episodes begin: the state of these environments is not part of a checkpoint")
         # If the critics estimate another policy than the deterministic one, both are evaluated.
         episodes = train.eval_episodes * (2 if agent_of(plan.config, plan.env).views.sample else 1)
         self._line(
@@ -81,7 +84,7 @@ class Announcer:
             self._line(f"curves: {self.plan.path / 'curves.png'}")
         if outcome.interrupted and self.plan.output["checkpoint_every"]:
             command = f"python -m experiments.run --resume={shlex.quote(str(self.plan.path))}"
-            if self.plan.own_env and is_factory(self.plan.options.env or ""):
+            if module_of(self.plan.config.env) or (self.plan.own_env and is_factory(self.plan.options.env or "")):
                 command += f" --env={self.plan.options.env}"
             elif self.plan.own_env:
                 command = f"experiments.run.main(['run', {f'--resume={self.plan.path}'!r}], env=env)"

@@ -113,6 +113,10 @@ class CheckpointStore:
             self._writer.join()
             self._writer = None
 
+    def newest(self) -> int | None:
+        """The env steps of the newest checkpoint; None: there is none."""
+        return max((step.env_steps for step in self._steps), default=None)
+
     def restore(self, template: TrainState) -> Restored | None:
         """The latest valid checkpoint, on the device; None if there is no checkpoint at all.
 

@@ -46,7 +46,7 @@ START = Position()
 class Outcome(NamedTuple):
     state: TrainState
     env_steps: int
-    interrupted: bool
+    interrupted: bool  # by a signal, or by an environment that failed
     diverged: dict[int, int]  # member -> environment steps
     wall_seconds: float
     train_seconds: float  # of this process, without compilation
@@ -111,6 +111,7 @@ def train_loop(
     report: Callable[[Report], None],
     display: Display,
     stop: Callable[[], bool],
+    failed: Callable[[], bool] = lambda: False,
     start: Position = START,
     checkpoint_every: int = 0,
     save: Callable[[TrainState, Position], None] = lambda state, position: None,
@@ -123,6 +124,8 @@ def train_loop(
       state: the training state at `start`. Only its first `num_members` members count; the rest is padding.
       report: called after each evaluation and, if there are steps since the last report, when stopped.
       stop: asked between chunks. Once it returns True, the state is saved and the loop returns.
+      failed: the same, asked whether an environment on the host has failed. The state is then that before the step
+        that failed; an evaluation that failed is not reported.
       checkpoint_every: environment steps between calls of `save`, which is also called at the end; 0: never.
       save: called after the report of an evaluation at the same step.
       evaluated_at: called after each evaluation with the state, its env steps, and the members' returns [S, episodes],
@@ -150,11 +153,16 @@ def train_loop(
             )
         )
 
+    def over() -> bool:
+        return stop() or failed()
+
     def evaluate_and_report() -> None:
         nonlocal last_return, evaluated
         show("evaluating" if pace.evaluations else "compiling the evaluation", done >= train.warmup_steps)
         before = clock()
-        evaluation, bias = sweep.evaluate(state)
+        evaluation, bias = jax.block_until_ready(sweep.evaluate(state))
+        if failed():
+            return
         returns, lengths, speeds = (of_members(leaf) for leaf in evaluation)
         pace.evaluated(clock() - before)
         bad = find_diverged(returns)
@@ -212,7 +220,7 @@ def train_loop(
     if checkpoint_every and evaluations:  # also if the last evaluation is all that is left
         checkpoints.add(train.steps)
     for point in sorted(evaluations | checkpoints):
-        while done < point and not stop():
+        while done < point and not over():
             learn = done >= train.warmup_steps
             end = point if learn else min(point, train.warmup_steps)
             steps = pace.chunk(learn, (end - done) // train.num_envs)
@@ -221,16 +229,18 @@ def train_loop(
             state = sweep.advance(state, steps, learn)
             jax.block_until_ready(state.env_steps)
             pace.advanced(learn, steps, clock() - before)
-            done += steps * train.num_envs
+            done = int(state.env_steps) if failed() else done + steps * train.num_envs
             find_diverged(None)
-        if stop():
-            interrupted = True
+        interrupted = over()
+        if point in evaluations and not interrupted:
+            evaluate_and_report()
+            interrupted = failed()
+        if interrupted:
             save_here()
             if done > reported:
                 send(None, None, {})
             break
         if point in evaluations:
-            evaluate_and_report()
             reported = done
             state = new_interval(state)
         if point in checkpoints:

@@ -17,9 +17,10 @@ from experiments.running import records, resume, run_config
 from experiments.running.run_config import Member, RunConfig
 from experiments.surroundings import jax_settings
 from sqt_jax import envs
-from sqt_jax.config import Config, TrainConfig
+from sqt_jax.config import ENVIRONMENT, Config, TrainConfig
+from sqt_jax.envs import gym_ids
 from sqt_jax.envs.factories import is_factory
-from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate
+from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate, named_env
 from sqt_jax.job_limits import memory_limits
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.settings import ConfigError, settings_of
@@ -43,6 +44,11 @@ class Plan(NamedTuple):
     def config(self) -> Config:
         """The first member's: all members have the same settings except the swept ones."""
         return self.members[0].config
+
+    @property
+    def given_env(self) -> Environment | None:
+        """What training is given: an environment handed in or on the host; None: it makes the named one."""
+        return self.env if self.own_env or self.env.host else None
 
     @property
     def train(self) -> TrainConfig:
@@ -82,11 +88,12 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
         except OSError as error:
             raise UsageError(f"--out={options.out}: expects a folder that can be read: {error}") from None
     config, count = target.members[0].config, len(target.members)
-    try:
-        used_env = env or envs.make(config.env, config.physics)
-    except ValueError as error:
-        raise UsageError(f"--physics: {error}") from None
     output = _output(options, target.resumed, config.train)
+    used_env = env or _named_env(config, output["env_processes"])
+    if used_env.host is None and options.env_processes:
+        raise UsageError(f"--env_processes: has no effect with {config.env}; expects an environment of Gymnasium's")
+    if used_env.host:
+        output["devices"] = _one_device(options.devices)
     layout = _layout(count, output["devices"], typed=options.devices is not None)
     needed, (free, where) = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
     if needed > free:
@@ -107,18 +114,34 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     )
 
 
+def _named_env(config: Config, processes: int) -> Environment:
+    try:
+        return named_env(config, config.physics, processes)
+    except ValueError as error:
+        flag = f"--env={config.env}" if envs.takes_arguments(config.env) else "--physics"
+        raise UsageError(f"{flag}: {error}") from None
+
+
+def _one_device(given: int | None) -> int:
+    if given not in (None, 1):
+        raise UsageError(f"--devices={given}: expects 1 with an environment on the host: all members share one call")
+    return 1
+
+
 def _check_env(options: flags.Options, env: Environment | None) -> None:
     """Rejects flags that contradict an environment handed in, or that need one."""
-    for flag in ("physics", "eval_physics"):
+    by_factory = is_factory(options.env or "")
+    for flag in ("physics", "eval_physics") if by_factory else ENVIRONMENT[1:]:
         if env is not None and flag in options.settings:
             raise UsageError(f"--{flag}: has no effect with an environment handed in")
+    for flag in ("physics", "eval_physics"):
         if options.settings.get(flag) == OWN_PHYSICS:
             raise UsageError(f"--{flag}={OWN_PHYSICS}: expects an environment handed in: run.main(argv, env=...)")
     if env is None:
         return
     if not isinstance(env, Environment):
         raise UsageError(f"env: expects an Environment (sqt_jax.make_environment), not a {type(env).__name__}")
-    if options.env not in (None, env.name) and not is_factory(options.env or ""):
+    if options.env not in (None, env.name) and not by_factory:
         raise UsageError(
             f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
         )
@@ -150,7 +173,8 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
         raise UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
     members, swept = run_config.make_members(options.seeds, configs), list(options.sweep)
-    folder = Path(options.out) / (_folder_name(env.name) if env else default.env) / default.algo
+    slug = default.env if envs.is_built_in(default.env) and not env else _folder_name(default.env)
+    folder = Path(options.out) / slug / default.algo
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
         return _Target(members=members, swept=swept, path=path, resumed=None)
@@ -182,6 +206,8 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
         raise UsageError(
             f"--resume={path}: expects the environment {name!r}, by --env=MODULE:FUNCTION or run.main(argv, env=...)"
         )
+    elif (module := gym_ids.module_of(name)) and options.env is None:
+        raise UsageError(f"--resume={path}: expects --env={name} too, which imports the module {module}")
     elif options.env:
         try:
             wanted["env"] = envs.resolve(options.env)

@@ -51,6 +51,7 @@ RUN_FILES = (
     "summary.json",
     "summary.json.part",
     "curves.png",
+    "error.txt",
 )
 RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "policy_best", "policy_best.part", "tensorboard")
 # Left by a run that died before it wrote its config.json.

@@ -16,7 +16,6 @@ from experiments.commandline.arguments import (
     FAILED,
     INTERRUPTED,
     UsageError,
-    one_line,
     printable,
 )
 from experiments.commandline.flags import Options
@@ -32,9 +31,12 @@ from experiments.running.run_policies import RunPolicies
 from experiments.running.signals import stop_on_signal
 from experiments.surroundings.consoles import console
 from sqt_jax.experiment import make_trainer, replay_of
+from sqt_jax.one_line import one_line
 from sqt_jax.policy_folders import BEST, LAST
 from sqt_jax.train import TrainState, make_sweep
-from sqt_jax.types import Array, Environment, Scalars
+from sqt_jax.types import Array, Environment, HostError, Scalars
+
+ERROR_FILE = "error.txt"  # the traceback of an environment that failed
 
 
 def start_session(options: Options, env: Environment | None, command: Sequence[str]) -> "Session":
@@ -64,7 +66,7 @@ class Session:
         self.console = console()
         self.display = Display(self.console, plan.train.steps, quiet=plan.options.quiet)
         self.announcer = Announcer(self.console, plan)
-        trainer = make_trainer(plan.config, plan.own_env)
+        trainer = make_trainer(plan.config, plan.given_env)
         self.sweep = make_sweep(trainer, plan.layout)
         self.init_arguments = _init_arguments(plan.members)
         # Shapes of the members only: with a layout, a state has padding too.
@@ -89,6 +91,8 @@ class Session:
             stack.enter_context(self._locked())
             stack.enter_context(self.display)
             received = stack.enter_context(stop_on_signal())
+            if self.plan.env.host:
+                stack.callback(self.plan.env.host.close)
             stack.callback(self.store.wait)
             # A new run writes its config.json first, so that it can be resumed from then on. An existing run is not
             # changed before it is certain that it can be resumed.
@@ -116,7 +120,25 @@ class Session:
                 return FAILED
 
         self.announcer.end(outcome, summary, tables.swept, curves)
+        if failure := self._environment_error():
+            return self._report_failure(failure)
         return INTERRUPTED if outcome.interrupted else DIVERGED if outcome.diverged else DONE
+
+    def _environment_error(self) -> HostError | None:
+        """The exception of an environment on the host that ended the run."""
+        return self.plan.env.host.error() if self.plan.env.host else None
+
+    def _report_failure(self, error: HostError) -> int:
+        """Writes the traceback to a file and prints the error in one line; returns the exit code."""
+        path, newest = self.plan.path / ERROR_FILE, self.store.newest()
+        try:
+            path.write_text(error.traceback)
+            where = f"traceback: {path}"
+        except OSError as problem:
+            where = f"the traceback cannot be written: {one_line(problem)}"
+        saved = "there is no checkpoint" if newest is None else f"the last checkpoint is of step {newest:,}"
+        print(printable(f"--env={self.plan.config.env}: {error.text}; {where}; {saved}"), file=sys.stderr)
+        return FAILED
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
@@ -232,7 +254,8 @@ class Session:
             self.policies.evaluated(state.agent, env_steps, returns)
 
         if self.restored:
-            first = self.restored.state
+            host = self.plan.env.host
+            first = self.sweep.restart(self.restored.state) if host else self.restored.state
         else:
             first = self.sweep.init(*self.init_arguments)
             self.policies.start(first.agent)
@@ -244,6 +267,7 @@ class Session:
             report=tables.report,
             display=self.display,
             stop=stop,
+            failed=lambda: self._environment_error() is not None,
             start=self.restored.position if self.restored else START,
             checkpoint_every=self.plan.output["checkpoint_every"],
             save=save,

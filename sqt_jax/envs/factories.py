@@ -2,12 +2,15 @@
 
 import importlib
 import re
-import traceback
-from pathlib import Path
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
 
+from sqt_jax.envs.gym_ids import from_gymnasium
+from sqt_jax.one_line import with_place
 from sqt_jax.types import Environment
 
-NAME = re.compile(r"(?!brax:)([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*):([A-Za-z_]\w*)", re.ASCII)
+NAME = re.compile(r"(?!(?:brax|gym|playground):)([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*):([A-Za-z_]\w*)", re.ASCII)
 
 
 def is_factory(name: str) -> bool:
@@ -15,10 +18,19 @@ def is_factory(name: str) -> bool:
     return NAME.fullmatch(name) is not None
 
 
-def make_from(name: str) -> Environment:
-    """The environment that a function of yours returns, called without arguments.
+def make_from(
+    name: str, arguments: Mapping[str, Any] | None = None, max_episode_steps: int = 0, processes: int = 0
+) -> Environment:
+    """The environment that a function of yours returns: an `Environment`, or one of Gymnasium.
+
+    A function for Gymnasium is called several times and has to return a new environment each time.
 
     This imports the module: call it with names only that the user has typed, never with those of a file.
+
+    Args:
+      arguments: keyword arguments of the function.
+      max_episode_steps: a time limit; only for Gymnasium's.
+      processes: as in `host.host_environment`; only for Gymnasium's.
 
     Raises:
       ValueError: there is no such module or function, it fails, or it returns something else. The text is one line
@@ -29,15 +41,24 @@ def make_from(name: str) -> Environment:
         raise ValueError(f"expects MODULE:FUNCTION, not {name!r}")
     module, function = match.groups()
     try:
-        env = getattr(importlib.import_module(module), function)()
+        make = partial(getattr(importlib.import_module(module), function), **(arguments or {}))
+        env = make()
     except Exception as error:  # of any type: it is the user's code
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        place = "" if last.filename == __file__ or "importlib" in last.filename else (
-            f" ({Path(last.filename).name}, line {last.lineno})"
-        )  # fmt: skip
-        raise ValueError(f"{text[:300]}{place}") from error
-    if not isinstance(env, Environment):
-        kind = type(env).__name__
-        raise ValueError(f"expects a function that returns an Environment (sqt_jax.make_environment), not a {kind}")
-    return env
+        raise ValueError(with_place(error, __file__)) from error
+    if isinstance(env, Environment):
+        if max_episode_steps or processes:
+            raise ValueError("--max_episode_steps and --env_processes have no effect with an Environment in JAX")
+        return env
+    if _is_gymnasium(env):
+        env.close()
+        return from_gymnasium(name, make, max_episode_steps, processes)
+    raise ValueError(
+        "expects a function that returns an Environment (sqt_jax.make_environment) or a gymnasium.Env, not a "
+        f"{type(env).__name__}"
+    )
+
+
+def _is_gymnasium(env: Any) -> bool:
+    import gymnasium
+
+    return isinstance(env, gymnasium.Env)
