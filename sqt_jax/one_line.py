@@ -6,7 +6,7 @@ from pathlib import Path
 
 def one_line(error: BaseException, limit: int = 300) -> str:
     """Type and message of an error, at most `limit` characters."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:limit]
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")[:limit]
 
 
 def with_place(error: BaseException, ours: str) -> str:

@@ -65,6 +65,7 @@ class Environment(NamedTuple):
     min_mean_episode_length: int = 1
     # Forward speed in m/s of the step that led to this time step; None: the environment does not measure it.
     speed: Callable[[TimeStep], Array] | None = None
+    version: str = ""  # the package that it comes from and its version, where other packages' versions do not say it
     # Of an environment whose episodes are on the host, outside the compiled program (Gymnasium's); None: it is pure.
     host: "Host | None" = None
 
@@ -88,6 +89,7 @@ class Host(NamedTuple):
     error: Callable[[], HostError | None]  # the exception, also of a separate one; None: there was none
     separate: Callable[[], "Environment"]  # the same environment with episodes of its own
     close: Callable[[], None]  # closes the environments and processes of all of these
+    make: Callable[..., Any]  # (further keyword arguments, as render_mode="rgb_array") -> one environment
 
 
 class Scalars(NamedTuple):

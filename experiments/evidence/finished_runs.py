@@ -104,6 +104,8 @@ def read_run(path: Path) -> list[MemberCurves]:
         settings["replay_capacity"] = rows if rows < settings["steps"] else "all"
         if evaluated_on is not None:
             settings["eval_physics"] = evaluated_on
+        if "env_version" in run.content:  # another version may be another task
+            settings["env_version"] = printable(run.content["env_version"])
         # Runs of an earlier version recorded the frozen critics of members that had diverged.
         diverged = np.isnan(own["return_mean"])
         critics = [name for name in ("q_mean", "q_std", "value_bias") if name in own]

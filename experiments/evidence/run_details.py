@@ -136,6 +136,7 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     return {
         "began": str(content.get("started") or NOT_RECORDED),
         "evaluated on": str(content.get("evaluated_on") or NOT_RECORDED),
+        **({"environment": content["env_version"]} if "env_version" in content else {}),
         "preset": str(content["preset"]),
         "device": ", ".join([*dict.fromkeys(words), *cpus]) or NOT_RECORDED,
         "commit": commit.replace("+changes", ", with uncommitted changes"),

@@ -58,6 +58,8 @@ def _unknown_algorithm(content: dict[str, Any]) -> RunSettings:
         raise ValueError
     if not run_config.is_valid_own_env(content.get("own_env", {}), settings["env"], settings["physics"]):
         raise ValueError
+    if not run_config.is_valid_version(content.get("env_version", "")):
+        raise ValueError
     members = []
     for entry in content["members"]:
         if type(entry["seed"]) is not int:

@@ -64,9 +64,9 @@ def table_1(sizes: Sequence[Mapping[str, Any]], reference: bool) -> ResultTable:
 
 
 def _known(name: str) -> Mapping[str, Any] | None:
-    """The sizes of an environment that can be made by its name here."""
+    """The sizes of an environment that can be made by its name here. Nothing is imported that a file names."""
     try:
-        return _sizes_by_name(name)
+        return _sizes_by_name(name) if envs.is_built_in(name) else None
     except ValueError:
         return None
 
@@ -79,9 +79,17 @@ def _sizes_by_name(name: str) -> Mapping[str, Any]:
     return {"env": name, "task": task} | sizes
 
 
+def _id(name: str) -> str | None:
+    """`Pendulum-v1` of `gym:Pendulum-v1`; None for a name without such a prefix."""
+    try:
+        return name.partition(":")[2] if envs.takes_arguments(envs.resolve(name)) else None
+    except ValueError:
+        return None
+
+
 def _sizes_by_runs(task: str, groups: Sequence[Group]) -> Mapping[str, Any] | None:
     """The sizes in the first config.json, or config.json of a policy, of the task's runs that has them; else None."""
-    kind = "own environment" if groups[0].own_env else "unknown here"
+    kind = "own environment" if groups[0].own_env else _id(task) or "unknown here"
     for run, own_sizes in dict.fromkeys((member.run, member.own_sizes) for g in groups for member in g.members):
         sizes = own_sizes or _sizes_of_policy(run)
         if sizes:

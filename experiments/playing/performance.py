@@ -10,7 +10,16 @@ import numpy as np
 from rich.console import Console
 
 from experiments.commandline.arguments import UsageError
-from experiments.playing import brax_pages, episodes, films, graphics, policies, rendering, viewer
+from experiments.playing import (
+    brax_pages,
+    episodes,
+    films,
+    graphics,
+    gymnasium_performance,
+    policies,
+    rendering,
+    viewer,
+)
 from experiments.playing.episodes import PlayedEpisode
 from experiments.playing.play_flags import is_brax
 from experiments.playing.played_task import PlayedTask, make_played_task
@@ -46,6 +55,11 @@ def perform(run: Path, options: argparse.Namespace) -> None:
     print(caption)
     print(f"physics {task.physics}, start seed {options.start_seed}, policy: {loaded.origin}", flush=True)
     console = consoles.console(stderr=True)
+    if task.env.host:
+        gymnasium_performance.perform(task.env, loaded.policy, options, caption, console)
+        return
+    if task.scene is None and options.video:
+        raise UsageError(f"--video: {task.env.name} is your own environment in JAX, which cannot be filmed")
     played = play_episodes(task, loaded.policy, options, console)
     for number, episode in enumerate(played):
         seconds = "" if math.isnan(task.period) else f", {episode.length * task.period:.1f} s"

@@ -3,7 +3,7 @@
 import argparse
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from experiments.commandline import arguments
@@ -21,7 +21,8 @@ newest checkpoint. Without a display, MUJOCO_GL selects OpenGL's implementation;
 works."""
 MAX_SEED = 2**32 - 1
 MAX_CONFIG_BYTES = 10_000_000
-BRAX = "brax:"  # `brax_envs.PREFIX`, whose module imports JAX
+# Of modules that import JAX: `brax_envs.PREFIX`, and the physics `experiment.OWN_PHYSICS` and `gym_ids.PHYSICS`.
+BRAX, OWN, HOST = "brax:", "own", "gymnasium"
 
 
 def parser() -> Parser:
@@ -35,7 +36,8 @@ def parser() -> Parser:
     add("--episodes", type=between(1, 1000), default=1, metavar="N", help="number of episodes (1)")
     add("--steps", type=between(1, 1_000_000), metavar="N", help="maximum steps of an episode (the task's time limit)")
     add("--start_seed", type=between(0, MAX_SEED), default=0, metavar="N", help="seed of the initial states (0)")
-    add("--env", metavar="MODULE:FUNCTION", help="of a run on an environment of your own: a function that returns it")
+    imports = "of a run on MODULE:FUNCTION or gym:MODULE:ID, the same again: its module is imported"
+    add("--env", metavar="NAME", help=imports)
     add("--physics", metavar="NAME", help="physics of the episodes (mujoco; for brax:ENV the run's)")
     add("--video", type=film, metavar="FILE", help="write a film: .mp4, .gif or .html; for brax:ENV only .html")
     add("--size", type=size, metavar="WIDTHxHEIGHT", help="size of the film in pixels (640x480)")
@@ -74,24 +76,29 @@ def check(run: Path, options: argparse.Namespace) -> None:
     """
     if not run.is_dir():
         raise UsageError(f"{run}: there is no such folder")
-    own = _setting(run, "physics") == "own"  # `sqt_jax.experiment.OWN_PHYSICS`, without importing JAX
+    physics, name = _setting(run, "physics"), _setting(run, "env")
+    own, host = physics == OWN, physics == HOST
     if own and options.env is None:
         raise UsageError(
             f"{run}: expects --env=MODULE:FUNCTION, a function that returns its own environment; or in Python: "
             f"sqt_jax.load_policy({str(run)!r}) and sqt_jax.evaluate_policy(policy, env)"
         )
-    if not own and options.env is not None:
+    if host and options.env is None and name.count(":") > 1:
+        raise UsageError(f"{run}: expects --env={name} too, which imports a module")
+    if host and options.env not in (None, name):
+        raise UsageError(f"--env={options.env}: expects {name}, the run's environment")
+    if not (own or host) and options.env is not None:
         raise UsageError(f"--env: expects a run on an environment of your own; {run} names its environment itself")
-    for flag, given in {"--video": options.video, "--physics": options.physics, "--camera": options.camera}.items():
-        if own and given:
-            raise UsageError(f"{flag}: has no effect with an environment of your own, which cannot be filmed")
+    for flag, given in {"--physics": options.physics, "--camera": options.camera, "--size": options.size}.items():
+        if (own or host) and given:
+            raise UsageError(f"{flag}: has no effect with {name}, which has its own")
     if options.video is None:
         for flag, given in {"--size": options.size, "--overwrite": options.overwrite}.items():
             if given:
                 raise UsageError(f"{flag}: has no effect without --video")
         return
     arguments.reject_file("--video", options.video, options.overwrite)
-    if is_brax(name := _setting(run, "env")):
+    if is_brax(name):
         if format_of(options.video) != "html":
             raise UsageError(f"--video={options.video}: expects a file with the ending .html, as {name} is Brax's")
         if options.size:
@@ -108,6 +115,9 @@ def chosen_graphics(run: Path, options: argparse.Namespace) -> Iterator[None]:
       UsageError: no OpenGL implementation works.
     """
     before = os.environ.get("MUJOCO_GL")
+    if not graphics.has_display():  # SDL, with which many environments of Gymnasium draw, would look for one
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
     try:
         os.environ["MUJOCO_GL"] = _graphics(run, options)
         yield
@@ -124,6 +134,10 @@ def _graphics(run: Path, options: argparse.Namespace) -> str:
     """A value of MUJOCO_GL; empty is MuJoCo's own choice."""
     if options.video is None or is_brax(_setting(run, "env")):
         return "" if graphics.has_display() else "disable"
+    if _setting(run, "physics") in (OWN, HOST):  # which may draw without OpenGL
+        with suppress(graphics.NoGraphics):
+            return graphics.choose()
+        return "disable"
     return graphics.choose()
 
 

@@ -9,8 +9,8 @@ from experiments.playing import brax_pages, episodes, rendering
 from experiments.playing.play_flags import is_brax
 from sqt_jax import envs
 from sqt_jax.config import Config
-from sqt_jax.envs import brax_envs, factories, gym_tasks
-from sqt_jax.experiment import env_of
+from sqt_jax.envs import brax_envs, env_args, factories, gym_ids, gym_tasks
+from sqt_jax.experiment import OWN_PHYSICS, env_of, named_env
 from sqt_jax.types import Environment, TimeStep
 
 
@@ -33,14 +33,13 @@ def make_played_task(config: Config, physics: str | None, camera: str, factory: 
       camera: the name of one of the model's cameras, or empty.
       factory: `module:function` of an environment of the user's own.
 
+    An environment on the host has its own model and pictures (`gymnasium_performance`).
+
     Raises:
       UsageError: the task has no such physics or camera, or a package for the physics is missing.
     """
-    if factory is not None:
-        try:
-            env = env_of(config, factories.make_from(factory))
-        except ValueError as error:
-            raise UsageError(f"--env={factory}: {error}") from error
+    if factory is not None or config.physics in gym_ids.PHYSICS:
+        env = _not_to_be_shown(config, factory)
         return PlayedTask(env=env, physics=config.physics, period=math.nan, look=lambda timestep: (), scene=None)
     brax = is_brax(config.env)
     physics = physics or (config.physics if brax else "mujoco")
@@ -72,3 +71,14 @@ def make_played_task(config: Config, physics: str | None, camera: str, factory: 
         look=episodes.configuration,
         scene=model,
     )
+
+
+def _not_to_be_shown(config: Config, factory: str | None) -> Environment:
+    """The environment of `gym:ID`, or of `module:function`."""
+    try:
+        if factory is None or config.physics != OWN_PHYSICS:
+            return named_env(config, config.physics)
+        arguments = env_args.parse(config.env_args)
+        return env_of(config, factories.make_from(factory, arguments, config.max_episode_steps))
+    except ValueError as error:
+        raise UsageError(f"--env={factory or config.env}: {error}") from error

@@ -45,7 +45,7 @@ class Announcer:
             self._line(f"resuming at {step}")
             if changed := resume.changed_device(plan.resumed, len(plan.layout.devices)):
                 self._line(f"not the device of before, results may differ in their last digits: {', '.join(changed)}")
-            if changed := resume.changed_versions(plan.resumed):
+            if changed := resume.changed_versions(plan.resumed, plan.env.version):
                 self._line(f"package versions differ from the run's, results may differ too: {', '.join(changed)}")
             if plan.env.host:
                 self._line("new episodes begin: the state of these environments is not part of a checkpoint")

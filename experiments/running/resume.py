@@ -104,10 +104,16 @@ def with_original_replay(run: RunConfig) -> list[Member]:
     return [_with_train(member, replay_capacity=run.content["replay_rows"]) for member in run.members]
 
 
-def changed_versions(run: RunConfig) -> list[str]:
-    """Packages whose version is not the run's, as `jax 0.9.0 -> 0.10.2`."""
+def changed_versions(run: RunConfig, env_version: str = "") -> list[str]:
+    """Packages whose version is not the run's, as `jax 0.9.0 -> 0.10.2`.
+
+    Args:
+      env_version: `Environment.version` now.
+    """
     old, new = run.content["versions"], run_config.versions()
-    return [f"{name} {_text(old.get(name))} -> {new[name]}" for name in new if old.get(name) != new[name]]
+    changed = [f"{name} {_text(old.get(name))} -> {new[name]}" for name in new if old.get(name) != new[name]]
+    before = run.content.get("env_version", "")
+    return [*changed, *([f"{_text(before)} -> {env_version}"] if before != env_version else [])]
 
 
 def changed_device(run: RunConfig, num_devices: int) -> list[str]:

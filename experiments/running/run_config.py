@@ -3,7 +3,8 @@
 Keys: `settings` (of the first member), `preset`, `replay_rows` (the replay's capacity per member, fixed when the run is
 created), `evaluated_on` (the physics that `eval_physics` chose), `swept` (names), `members` (seed and swept values),
 `output` (`flag_table.OutputConfig`), `command`, `started`, `device`, `commit`, `versions`, `resumed` (an entry per
-resumption), and `own_env` (sizes, only if the environment was handed in).
+resumption), `own_env` (sizes, only if the environment was handed in), and `env_version` (the package of the environment
+and its version, only of gym:ID and the like).
 """
 
 import json
@@ -29,6 +30,7 @@ from sqt_jax.types import Environment, Scalars
 
 NAME = "config.json"
 MAX_BYTES = 10_000_000
+MAX_VERSION = 200  # characters of `env_version`
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "brax", "gymnasium", "numpy", "sqt_jax")
 
 
@@ -80,6 +82,7 @@ def new_content(
     output: Mapping[str, Any],
     own_env: Environment | None = None,
     num_devices: int = 1,
+    env_version: str = "",
 ) -> dict[str, Any]:
     """The content of config.json for a run that starts now on `num_devices` devices."""
     content = {
@@ -101,7 +104,8 @@ def new_content(
         "versions": versions(),
         "resumed": [],
     }
-    return content if own_env is None else content | {"own_env": sizes_of(own_env)}
+    content |= {"own_env": sizes_of(own_env)} if own_env else {}
+    return content | ({"env_version": env_version} if env_version else {})
 
 
 def device_here(num_devices: int) -> dict[str, Any]:
@@ -135,6 +139,8 @@ def read(path: Path) -> RunConfig:
         config, rows = members[0].config, content["replay_rows"]
         if not is_valid_own_env(content.get("own_env", {}), config.env, config.physics):
             raise InvalidRunConfig(f"its {NAME} does not describe a run")
+        if not is_valid_version(content.get("env_version", "")):
+            raise InvalidRunConfig(f"its {NAME} does not describe a run")
         train = config.train
         if not train.batch_size <= rows <= train.capacity or rows % train.num_envs:
             raise InvalidRunConfig(f"its {NAME} has an invalid replay capacity (replay_rows)")
@@ -159,6 +165,11 @@ def is_valid_own_env(own_env: Any, env: str, physics: str) -> bool:
     if not isinstance(own_env, dict) or physics != OWN_PHYSICS or not env.isprintable():
         return False
     return all(type(own_env.get(name)) is int and own_env[name] > 0 for name in ("observation_size", "action_size"))
+
+
+def is_valid_version(version: Any) -> bool:
+    """Whether `env_version` of config.json is a short text."""
+    return isinstance(version, str) and version.isprintable() and len(version) <= MAX_VERSION
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:

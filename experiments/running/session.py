@@ -192,6 +192,7 @@ class Session:
                 plan.output,
                 plan.own_env,
                 len(plan.layout.devices),
+                plan.env.version,
             )
             run_config.write(plan.path, content)
         except records.NotARun:

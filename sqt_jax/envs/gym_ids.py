@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import metadata
 from typing import Any
 
 import jax
@@ -79,7 +80,7 @@ def from_gymnasium(name: str, make: Callable[[], Any], max_episode_steps: int = 
     try:
         env = make()
         limit = time_limit(env)
-        in_jax = uses_jax(env)
+        in_jax, version = uses_jax(env), version_of(env)
         env.close()
     except Exception as error:
         raise ValueError(with_place(error, __file__)) from error
@@ -88,25 +89,25 @@ def from_gymnasium(name: str, make: Callable[[], Any], max_episode_steps: int = 
     if in_jax and not processes:
         raise ValueError("computes with JAX, which would wait for itself inside our program; add --env_processes=N")
     try:
-        return host_environment(name, partial(quiet, make), limit, processes)
+        return host_environment(name, partial(quiet, make), limit, processes, version)
     except ValueError:
         raise
     except Exception as error:
         raise ValueError(one_line(error)) from error
 
 
-def quiet(make: Callable[[], Any]) -> Any:
-    """`make()` without its warnings: the first environment has shown them."""
+def quiet(make: Callable[..., Any], **more: Any) -> Any:
+    """`make(**more)` without its warnings: the first environment has shown them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return make()
+        return make(**more)
 
 
-def limited(make: Callable[[], Any], max_episode_steps: int) -> Any:
-    """`make()` with a time limit."""
+def limited(make: Callable[..., Any], max_episode_steps: int, **more: Any) -> Any:
+    """`make(**more)` with a time limit."""
     from gymnasium.wrappers import TimeLimit
 
-    return TimeLimit(make(), max_episode_steps)
+    return TimeLimit(make(**more), max_episode_steps)
 
 
 def time_limit(env: Any) -> int | None:
@@ -120,6 +121,13 @@ def time_limit(env: Any) -> int | None:
             limits.append(env._max_episode_steps)
         env = env.env
     return min(filter(None, limits), default=None)
+
+
+def version_of(env: Any) -> str:
+    """The package that a Gymnasium environment comes from and its version; empty for a module of the user's own."""
+    module = type(env.unwrapped).__module__.partition(".")[0]
+    names = metadata.packages_distributions().get(module, [])
+    return f"{names[0]} {metadata.version(names[0])}" if names else ""
 
 
 def uses_jax(env: Any) -> bool:

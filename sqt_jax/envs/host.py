@@ -38,15 +38,18 @@ class HostState(NamedTuple):
     unstable_starts: Array  # [] int32
 
 
-def host_environment(name: str, make: Make, episode_length: int, processes: int = 0) -> Environment:
+def host_environment(
+    name: str, make: Callable[..., Any], episode_length: int, processes: int = 0, version: str = ""
+) -> Environment:
     """An `Environment` whose episodes are played by Gymnasium environments.
 
     Args:
       name: used in messages and records.
       make: makes one Gymnasium environment; called once for each that plays in parallel. With `processes`, it is
-        pickled.
+        pickled. `Host.make` passes keyword arguments to it.
       episode_length: the environment's time limit, in steps.
       processes: how many processes share the environments; 0: this one plays them all.
+      version: as in `Environment`.
 
     Raises:
       ValueError: `gym_spaces` rejects the observation or action space, or `processes` is negative.
@@ -65,7 +68,37 @@ def host_environment(name: str, make: Make, episode_length: int, processes: int 
             return LocalRows(make, count)
         return host_processes.ProcessRows(make, count, processes, sizes)
 
-    return _environment(name, make_rows, sizes, episode_length, family=[])
+    def environment(family: list[Episodes]) -> Environment:
+        """An environment with episodes of its own, which join those of its family."""
+        episodes = Episodes(make_rows, *sizes)
+        family.append(episodes)
+        functions = episode_functions(episodes)
+
+        def close() -> None:
+            for member in family:
+                member.close()
+
+        host = Host(
+            restart=functions.restart,
+            failed=lambda timestep: timestep.state.failed,
+            error=lambda: next((member.error for member in family if member.error), None),
+            separate=lambda: environment(family),
+            close=close,
+            make=make,
+        )
+        return Environment(
+            name=name,
+            observation_size=sizes[0],
+            action_size=sizes[1],
+            episode_length=episode_length,
+            reset=functions.reset,
+            step=functions.step,
+            status=status,
+            version=version,
+            host=host,
+        )
+
+    return environment([])
 
 
 def _sizes(make: Make) -> tuple[int, int]:
@@ -77,17 +110,17 @@ def _sizes(make: Make) -> tuple[int, int]:
         env.close()
 
 
-def _environment(
-    name: str,
-    make_rows: Callable[[int], Rows],
-    sizes: tuple[int, int],
-    episode_length: int,
-    family: list[Episodes],
-) -> Environment:
-    """An environment with episodes of its own, which join those of its `family`."""
-    observation_size, action_size = sizes
-    episodes = Episodes(make_rows, observation_size, action_size)
-    family.append(episodes)
+class EpisodeFunctions(NamedTuple):
+    """`reset` and `step` of an `Environment`, and `Host.restart`."""
+
+    reset: Callable[[Array], TimeStep]
+    step: Callable[[TimeStep, Array], TimeStep]
+    restart: Callable[[TimeStep], TimeStep]
+
+
+def episode_functions(episodes: Episodes) -> EpisodeFunctions:
+    """The functions of one environment that play `episodes` through calls to the host."""
+    observation_size = episodes.observation_size
     shape = jax.ShapeDtypeStruct((episodes.out_words,), jnp.uint32)
     start_on_host, step_on_host = _callback(episodes.start, shape), _callback(episodes.step, shape)
 
@@ -131,30 +164,12 @@ def _environment(
         bits = jax.lax.bitcast_convert_type(action, jnp.uint32)
         return timestep_of(step_on_host(jnp.concatenate([state.call, state.key, state.steps[None], bits])), state)
 
-    def status(timestep: TimeStep) -> Metrics:
-        return {"unstable_steps": timestep.state.unstable, "unstable_starts": timestep.state.unstable_starts}
+    return EpisodeFunctions(reset=reset, step=step, restart=lambda timestep: start(timestep.state))
 
-    def close() -> None:
-        for member in family:
-            member.close()
 
-    host = Host(
-        restart=lambda timestep: start(timestep.state),
-        failed=lambda timestep: timestep.state.failed,
-        error=lambda: next((member.error for member in family if member.error), None),
-        separate=lambda: _environment(name, make_rows, sizes, episode_length, family),
-        close=close,
-    )
-    return Environment(
-        name=name,
-        observation_size=observation_size,
-        action_size=action_size,
-        episode_length=episode_length,
-        reset=reset,
-        step=step,
-        status=status,
-        host=host,
-    )
+def status(timestep: TimeStep) -> Metrics:
+    """The counts of `HostState`, [] each."""
+    return {"unstable_steps": timestep.state.unstable, "unstable_starts": timestep.state.unstable_starts}
 
 
 def _callback(play: Callable[[np.ndarray], np.ndarray], shape: Any) -> Callable[[Array], Array]:
