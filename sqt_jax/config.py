@@ -130,7 +130,9 @@ class Config:
 
     algo: str
     env: str
-    physics: str = setting("mjx", "the physics: mjx, mujoco or warp; brax:NAME has others")
+    physics: str = setting(
+        "mjx", "the physics: mjx, mujoco or warp; not mujoco for playground:NAME; brax:NAME has others"
+    )
     eval_physics: str = setting("auto", "the same for evaluation; auto: mujoco on a CPU, else the training's")
     env_args: str = setting("", "keyword arguments of gym:ID, playground:NAME or MODULE:FUNCTION: NAME=VALUE,...")
     max_episode_steps: int = setting(
