@@ -134,9 +134,13 @@ class Config:
         "mjx", "the physics: mjx, mujoco or warp; not mujoco for playground:NAME; brax:NAME has others"
     )
     eval_physics: str = setting("auto", "the same for evaluation; auto: mujoco on a CPU, else the training's")
-    env_args: str = setting("", "keyword arguments of gym:ID, playground:NAME or MODULE:FUNCTION: NAME=VALUE,...")
+    env_args: str = setting(
+        "",
+        "keyword arguments of the environment, NAME=VALUE,... (gym:ID, playground:NAME, MODULE:FUNCTION)",
+        default_text="none",
+    )
     max_episode_steps: int = setting(
-        0, "time limit of an episode of gym:ID, playground:NAME or MODULE:FUNCTION; 0: the environment's own", low=0
+        0, "time limit of its episodes (gym:ID, playground:NAME, MODULE:FUNCTION); 0: the environment's own", low=0
     )
     agent: AgentConfig = AgentConfig()
     train: TrainConfig = TrainConfig()

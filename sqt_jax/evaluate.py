@@ -9,6 +9,7 @@ import numpy as np
 
 from sqt_jax import rollout
 from sqt_jax.bias import BiasSums
+from sqt_jax.conditional import any_in_batch
 from sqt_jax.types import Array, Environment, Metrics, Transition
 
 PolicyWithBonus = Callable[[Array, Array], tuple[Array, Array]]  # obs [E, O], key -> action [E, A], entropy bonus [E]
@@ -92,7 +93,9 @@ def _play(
     policy_key = jax.random.fold_in(key, 2**31)
 
     def any_running(carry):
-        return jnp.any(carry[2])
+        running = jnp.any(carry[2])
+        # On the host one call steps the environments of all members: none may stop before the others.
+        return any_in_batch(running) if env.host else running
 
     def body(carry):
         number, timestep, running, (returns, lengths, speed_sums), extra = carry
@@ -134,11 +137,15 @@ def evaluate_policy(
     Raises:
       ValueError: the policy's actions have another size than the environment's. With a Gymnasium environment also:
         an action is NaN, or `envs.gym_spaces` rejects a space.
+      RuntimeError: an environment on the host (`gym:ID`) raised an exception.
     """
     if isinstance(env, Environment):
         checked = _checked(policy, env.action_size)
         result = jax.jit(lambda key: evaluate(env, checked, key, num_episodes))(jax.random.key(seed))
-        return np.asarray(result.returns), np.asarray(result.lengths)
+        returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
+        if env.host and (error := env.host.error()):
+            raise RuntimeError(f"{env.name}: {error.text}\n{error.traceback}")
+        return returns, lengths
     from sqt_jax.envs import gym_spaces  # imports gymnasium, which environments in JAX do not need
 
     observations, actions = gym_spaces.observations(env.observation_space), gym_spaces.actions(env.action_space)

@@ -1,4 +1,7 @@
-"""`cond_if_any` has the values of a select under any nesting of vmap, and runs its branch only if an entry needs it."""
+"""`cond_if_any` has the values of a select under any nesting of vmap, and runs its branch only if an entry needs it.
+
+`any_in_batch` is one answer for a whole batch.
+"""
 
 import re
 
@@ -7,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sqt_jax.conditional import cond_if_any
+from sqt_jax.conditional import any_in_batch, cond_if_any
 
 
 def branch(old, given):
@@ -99,3 +102,19 @@ def test_derivatives_are_forward_only():
     assert jax.jvp(double, (1.0,), (1.0,)) == (2.0, 2.0)
     with pytest.raises(ValueError, match="reverse-mode"):
         jax.grad(double)(1.0)
+
+
+def test_any_in_batch_is_one_answer_for_all():
+    flags = jnp.array([[False, False], [True, False]])
+    inner = jax.vmap(any_in_batch, out_axes=None)
+    assert not inner(flags[0]) and inner(flags[1])
+    outer = jax.vmap(jax.vmap(any_in_batch, out_axes=None), out_axes=None)
+    assert outer(flags) and not outer(flags[:1])
+
+
+def test_a_loop_on_any_in_batch_is_not_selected_for_each_entry():
+    def count(limit):
+        return jax.lax.while_loop(lambda n: any_in_batch(n < limit), lambda n: n + 1, jnp.zeros((), jnp.int32))
+
+    counts = jax.vmap(count)(jnp.array([1, 5, 3]))
+    np.testing.assert_array_equal(counts, [5, 5, 5])

@@ -321,7 +321,7 @@ def test_flat_settings_survive_json(config):
 
 def test_no_setting_has_two_owners():
     config = CONFIGS[0]
-    assert len(config.flat()) == 4 + len(AgentConfig.__dataclass_fields__) + len(TrainConfig.__dataclass_fields__)
+    assert len(config.flat()) == 6 + len(AgentConfig.__dataclass_fields__) + len(TrainConfig.__dataclass_fields__)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Evaluation: each episode to its own end, from fresh starts, under the given policy."""
 
+import functools
 import re
 import warnings
 
@@ -8,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
+from host_tasks import Counter
 from probe_envs import constant_reward, countdown, one_step
 
 from sqt_jax import envs, rollout
 from sqt_jax.envs.autoreset import make_environment
+from sqt_jax.envs.gym_ids import from_gymnasium
 from sqt_jax.evaluate import evaluate, evaluate_policy, evaluate_with_bias
 
 KEY = jax.random.key(0)
@@ -207,3 +210,27 @@ def test_a_policy_with_actions_of_another_size_is_rejected(env, shape):
 def test_a_policy_with_actions_that_are_nan_is_rejected():
     with pytest.raises(ValueError, match="^action: expects numbers in .*, not "):
         evaluate_policy(lambda obs: obs * np.nan, Ladder())
+
+
+def test_an_exception_in_an_environment_on_the_host_is_raised():
+    env = from_gymnasium("counter", functools.partial(Counter, fails_at=4), max_episode_steps=6)
+    with pytest.raises(RuntimeError, match="counter: RuntimeError: the simulator is gone"):
+        evaluate_policy(lambda obs: jnp.zeros((len(obs), 3)), env, num_episodes=2)
+
+
+def test_episodes_on_the_host_are_those_of_gymnasium():
+    env = from_gymnasium("counter", Counter, max_episode_steps=6)
+    returns, lengths = evaluate_policy(lambda obs: jnp.zeros((len(obs), 3)), env, num_episodes=3)
+    assert returns.tolist() == [21, 21, 21] and lengths.tolist() == [6, 6, 6]
+
+
+def test_members_on_the_host_end_their_evaluations_at_different_steps():
+    env = from_gymnasium("counter", Counter, max_episode_steps=6)
+
+    def policy(obs):  # ends the episode at once where its start is above 0.5
+        return jnp.stack([obs[:, 0], jnp.where(obs[:, 0] > 0.5, 1.0, 0.0), obs[:, 0]], axis=1) * jnp.array([0, 1, 0])
+
+    keys = jax.random.split(jax.random.key(5), 8)
+    found = jax.jit(jax.vmap(lambda key: evaluate(env, policy, key, 1)))(keys)
+    assert env.host.error() is None
+    assert set(zip(found.lengths[:, 0].tolist(), found.returns[:, 0].tolist(), strict=True)) == {(1, 1.0), (6, 21.0)}

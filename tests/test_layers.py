@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # The lowest first; a module imports from lower layers only, or from its own package further down.
 LAYERS = [
-    {"sqt_jax.types", "sqt_jax.suggestions", "sqt_jax.job_limits", "sqt_jax.policy_folders"},
+    {"sqt_jax.types", "sqt_jax.suggestions", "sqt_jax.one_line", "sqt_jax.job_limits", "sqt_jax.policy_folders"},
     {"sqt_jax.members", "sqt_jax.conditional", "sqt_jax.trees"},
     {"sqt_jax.settings", "sqt_jax.q_targets", "sqt_jax.networks", "sqt_jax.bias", "sqt_jax.optimizers", "sqt_jax.ring"},
     {"sqt_jax.config", "sqt_jax.replay", "sqt_jax.lap", "sqt_jax.gaussian"},

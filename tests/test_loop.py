@@ -18,7 +18,7 @@ class Recorder:
         self.train, self.breaks_at = train, breaks_at
         self.now, self.done = 0.0, 0
         self.calls, self.reports, self.statuses, self.messages = [], [], [], []
-        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate, measure=self.measure)
+        self.sweep = Sweep(init=None, advance=self.advance, evaluate=self.evaluate, measure=self.measure, restart=None)
         self.evaluated = lambda steps, returns, lengths, speeds: None
         self.update, self.message = self.statuses.append, self.messages.append
 
@@ -159,6 +159,36 @@ def test_a_run_stopped_before_its_last_evaluation_is_interrupted():
     recorder = Recorder(TRAIN)
     outcome = recorder.run(stop=lambda: recorder.done >= 2_000)
     assert outcome.interrupted and outcome.env_steps == 2_000
+
+
+def test_an_environment_that_fails_in_training_ends_the_run_at_the_step_before():
+    recorder = Recorder(TRAIN)
+    advance = recorder.advance
+
+    def fail_at_900(state, steps, learn):
+        if recorder.done + steps <= 900:
+            return advance(state, steps, learn)
+        return advance(state, 900 - recorder.done, learn)
+
+    recorder.sweep = recorder.sweep._replace(advance=fail_at_900)
+    outcome = recorder.run(failed=lambda: recorder.done == 900, checkpoint_every=500)
+    assert outcome.interrupted and outcome.env_steps == 900
+    assert [position.env_steps for position in recorder.saved] == [500, 900]
+    assert [(report.env_steps, report.returns is None) for report in recorder.reports[1:]] == [
+        (500, False),
+        (900, True),
+    ]
+
+
+def test_an_environment_that_fails_in_an_evaluation_ends_the_run_without_its_returns():
+    recorder = Recorder(TRAIN)
+    evaluations = []
+    evaluate = recorder.evaluate
+    recorder.sweep = recorder.sweep._replace(evaluate=lambda state: (evaluations.append(state), evaluate(state))[1])
+    outcome = recorder.run(failed=lambda: len(evaluations) == 3, checkpoint_every=2_000)
+    assert outcome.interrupted and outcome.env_steps == 1_000
+    assert [(position.env_steps, position.evaluated) for position in recorder.saved] == [(1_000, 500)]
+    assert [report.returns is None for report in recorder.reports] == [False, False, True]
 
 
 def test_a_member_that_diverges_is_named_once_and_its_later_returns_do_not_count():

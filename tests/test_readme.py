@@ -13,6 +13,7 @@ from absl.testing import flagsaver
 
 from experiments import bench, play, plots, report, run, tables
 from experiments.commandline import flag_table, flags
+from experiments.run import own_environment
 from experiments.running.plan import make_plan
 
 ROOT = Path(__file__).parent.parent
@@ -117,13 +118,25 @@ def test_the_loop_of_the_guide_trains_td7_too():
     assert names["state"].checkpoints.assessments == 2  # an episode has 200 steps, and the first one was the warm-up
 
 
+OWN_MODULE = """
+import jax.numpy as jnp
+import sqt_jax
+
+def make(mass):
+    return sqt_jax.make_environment("flat", 1, 1, 9, lambda key: (jnp.zeros(1),) * 2, lambda x, a: (x, x, mass, False))
+"""
+
+
 @pytest.mark.parametrize("argv", RUNS, ids=ids)
-def test_commands_that_train_are_valid(argv, tmp_path):
+def test_commands_that_train_are_valid(argv, tmp_path, monkeypatch):
+    (tmp_path / "my_tasks").mkdir()
+    (tmp_path / "my_tasks/pendulum.py").write_text(OWN_MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
     if any(word.startswith("--resume=") for word in argv):  # of a run that does not exist here
         assert flags.parse(argv).resume.startswith("runs/")
         return
     options = flags.parse([*argv, f"--out={tmp_path}", "--replay_capacity=1000"])
-    assert make_plan(options).members
+    assert make_plan(options, own_environment(options)).members
 
 
 @pytest.mark.parametrize("argv", SWEEPS, ids=ids)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import UsageError
 from experiments.evidence.published import PAPERS_TASKS
+from experiments.running import run_config
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
 from sqt_jax.suggestions import expects_one_of
@@ -85,7 +86,9 @@ def cells_of(grid: Grid, algos: Sequence[str], tasks: Sequence[str], out: Path, 
             run_flags = (*grid.flags, *flags)
             name = run_name(run_flags)
             command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name}", "--resume", *run_flags)
-            cells.append(GridCell(task=task, algo=algo, path=out / task / algo / name, command=command))
+            cells.append(
+                GridCell(task=task, algo=algo, path=out / run_config.task_folder(task) / algo / name, command=command)
+            )
     return cells
 
 

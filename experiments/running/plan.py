@@ -1,7 +1,6 @@
 """From a command line to a plan (settings, folder, devices), checked before anything is written or compiled."""
 
 import dataclasses
-import re
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
@@ -145,12 +144,8 @@ def _check_env(options: flags.Options, env: Environment | None) -> None:
         raise UsageError(
             f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
         )
-    if not isinstance(env.name, str) or not env.name.isprintable() or not _folder_name(env.name).strip("."):
+    if not isinstance(env.name, str) or not env.name.isprintable() or not run_config.task_folder(env.name).strip("."):
         raise UsageError(f"env: expects an environment with a name that can name a folder, not {env.name!r}")
-
-
-def _folder_name(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9._-]", "-", name)
 
 
 def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
@@ -173,8 +168,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
         raise UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
     members, swept = run_config.make_members(options.seeds, configs), list(options.sweep)
-    slug = default.env if envs.is_built_in(default.env) and not env else _folder_name(default.env)
-    folder = Path(options.out) / slug / default.algo
+    folder = Path(options.out) / run_config.task_folder(default.env) / default.algo
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
         return _Target(members=members, swept=swept, path=path, resumed=None)

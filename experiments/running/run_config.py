@@ -9,6 +9,7 @@ and its version, only of gym:ID and the like).
 
 import json
 import os
+import re
 import subprocess
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -196,6 +197,11 @@ def resumed_content(
 def versions() -> dict[str, str | None]:
     """The versions of `PACKAGES` by name; None: not installed."""
     return {name: _version(name) for name in PACKAGES}
+
+
+def task_folder(env: str) -> str:
+    """The name of the folder with the runs on an environment: its own, with `-` where a file name has none of it."""
+    return env if envs.is_built_in(env) else re.sub(r"[^A-Za-z0-9._-]", "-", env)
 
 
 def default_name(changed: Mapping[str, Any], now: datetime) -> str:

@@ -41,7 +41,8 @@ def make_from(
         raise ValueError(f"expects MODULE:FUNCTION, not {name!r}")
     module, function = match.groups()
     try:
-        make = partial(getattr(importlib.import_module(module), function), **(arguments or {}))
+        make = getattr(importlib.import_module(module), function)
+        make = partial(make, **arguments) if arguments else make
         env = make()
     except Exception as error:  # of any type: it is the user's code
         raise ValueError(with_place(error, __file__)) from error

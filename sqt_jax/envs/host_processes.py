@@ -8,9 +8,10 @@ import multiprocessing
 import os
 import signal
 import threading
+import warnings
 from contextlib import suppress
 from functools import partial
-from multiprocessing import forkserver, util
+from multiprocessing import connection, forkserver, util
 from typing import Any
 
 import gymnasium
@@ -64,7 +65,8 @@ class ProcessRows:
         try:
             packed, *_, info = self.workers.step(padded)
         except (EOFError, OSError):
-            codes = [worker.exitcode for worker in self.workers.processes if worker.exitcode]
+            ended = connection.wait([worker.sentinel for worker in self.workers.processes], timeout=5)
+            codes = [worker.exitcode for worker in self.workers.processes if worker.sentinel in ended]
             raise RuntimeError(f"a worker process ended by itself (exit codes: {codes or 'unknown'})") from None
         if ERROR in info:
             raise WorkerError(next(error for error in info[ERROR] if error))
@@ -149,9 +151,11 @@ def _close(workers: AsyncVectorEnv) -> None:
 
     timer = threading.Timer(SECONDS_TO_CLOSE, kill)
     timer.start()
-    with suppress(Exception):  # of a worker that has ended, or that is killed now
+    with suppress(Exception), warnings.catch_warnings():  # of a worker that has ended, or that is killed now
+        warnings.simplefilter("ignore")
         workers.close()
     timer.cancel()
+    workers.closed = True  # else it tries again when it is collected
     kill()
     for worker in workers.processes:
         worker.join()
