@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from sqt_jax.agents import released, sac, td3, td7
+from sqt_jax.agents import normalised, released, sac, td3, td7
 from sqt_jax.config import SETTINGS, AgentConfig, TrainConfig, check_agent
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.suggestions import did_you_mean, expects_one_of
@@ -155,14 +155,18 @@ def make_parts(algo: str, config: AgentConfig, observation_size: int, action_siz
     row = ALGORITHMS[algo]
     default = default_agent_config(algo)
     as_released = any(getattr(config, name) != getattr(default, name) for name in released.SETTINGS)
-    return (row.build_released if as_released else row.build)(config, observation_size, action_size)
+    parts = (row.build_released if as_released else row.build)(config, observation_size, action_size)
+    # With policy checkpoints it is the learner inside them that is normalised (`td7.with_checkpoints`).
+    normalise = config.normalize_observations and "checkpoints" not in row.features
+    return normalised.around(parts, observation_size) if normalise else parts
 
 
 def make_agent(algo: str, observation_size: int, action_size: int, **settings: Any) -> Agent:
     """An algorithm's functions, for a loop and an environment of your own.
 
     td3 and sac need `init`, `act` and `update`. td7 also needs `observe` after each step of its one environment, or it
-    keeps acting with its initial policy, and `sqt_jax.lap` as its replay.
+    keeps acting with its initial policy, and `sqt_jax.lap` as its replay. `normalize_observations` needs `see` before
+    each step.
 
     Args:
       observation_size, action_size: O and A; actions are in [-1, 1].

@@ -44,6 +44,9 @@ class AgentConfig:
     ensemble_size: int = setting(2, "number of critics", low=1, high=1000)
     hidden: tuple[int, ...] = setting((256, 256), "widths of the hidden layers")
     layer_norm: bool = setting(False, "normalise the critics' hidden layers before their ReLU", features=("mlp",))
+    normalize_observations: bool = setting(
+        False, "normalise observations by the mean and std of those seen so far, clipped to +-10"
+    )
     # Optimisation.
     lr: float = setting(3e-4, "Adam's learning rate", low=0, high=1, swept=True)
     gamma: float = setting(0.99, "discount factor", low=0, high=1, swept=True)

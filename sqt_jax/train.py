@@ -128,7 +128,8 @@ def make_trainer(
 
         def behaviour(obs):
             uniform = rollout.uniform_actions(warmup_key, num_envs, env.action_size)
-            return jnp.where(learn, agent.act(state.agent, obs, act_key), uniform)
+            seen = agent.see(state.agent, obs)  # kept by `learn_from`: the step may fail
+            return jnp.where(learn, agent.act(seen, obs, act_key), uniform)
 
         timestep, transition = rollout.step(env, state.timestep, behaviour)
 
@@ -157,7 +158,8 @@ def make_trainer(
         # An episode that began in the warm-up has random actions in it: its return is not the policy's.
         begun = state.env_steps - num_envs * state.episodes.running_length.astype(jnp.int32)
         ended = over & learn & (begun >= config.warmup_steps)
-        agent_state = agent.observe(state.agent, episode_return, ended, state.gradient_steps)
+        agent_state = agent.see(state.agent, transition.obs)
+        agent_state = agent.observe(agent_state, episode_return, ended, state.gradient_steps)
         replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):

@@ -161,6 +161,16 @@ class Observe(Protocol):
         """
 
 
+class See(Protocol):
+    """`Agent.see`."""
+
+    def __call__(self, state: State, obs: Array) -> State:
+        """Reports the observations [E, O] that the behaviour acts on; called once per environment step, before `act`.
+
+        Only agents with `normalize_observations` use it, for their statistics. Without it they only clip observations.
+        """
+
+
 class Views(NamedTuple):
     """Read-only functions of an agent's state: for evaluation, for records, for saving a policy."""
 
@@ -181,6 +191,7 @@ class Agent(NamedTuple):
     update: Update
     views: Views
     observe: Observe = lambda state, episode_return, ended, step: state
+    see: See = lambda state, obs: state
 
 
 class Parts(NamedTuple):

@@ -36,7 +36,7 @@ def test_a_setting_without_a_flag_is_set_by_the_algorithm_or_by_another_flag():
 def test_defaults_are_shown_as_the_algorithms_rows_have_them(algo):
     config, training = default_agent_config(algo), ALGORITHMS[algo].training
     for name, flag in ROWS.items():
-        if name not in SETTINGS or not has_effect(algo, name):
+        if name not in SETTINGS or SETTINGS[name].default_text or not has_effect(algo, name):
             continue
         value = getattr(config, name, training.get(name, SETTINGS[name].default))
         text = str(value).lower() if isinstance(value, bool) else str(value)

@@ -186,3 +186,10 @@ def test_a_process_that_ends_is_an_error():
     assert bool(env.host.failed(play([GO] * 3, env=env)[-1]))
     assert "a worker process ended by itself (exit codes: [7])" in env.host.error().text
     env.host.close()
+
+
+def test_on_an_accelerator_the_call_is_pure_and_plays_the_same(monkeypatch):
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cpu, default: default(*args))
+    env = counter()
+    for ours, theirs in zip(play([GO, END, GO], env=env), play([GO, END, GO]), strict=True):
+        assert observed(ours) == observed(theirs) and ours.reward == theirs.reward

@@ -87,11 +87,12 @@ EXCEPT = {("sqt_jax.evaluate", "sqt_jax.envs.gym_spaces")}  # converts numbers, 
 # The agents that an agent may import: TD7 is TD3's successor, and the released code varies all three.
 AGENTS = {
     "critic": (),
+    "normalised": (),
     "policy_checkpoints": (),
     "td3": ("critic",),
     "sac": ("critic",),
-    "td7": ("critic", "policy_checkpoints", "td3"),
-    "released": ("policy_checkpoints", "td3", "sac", "td7"),
+    "td7": ("critic", "normalised", "policy_checkpoints", "td3"),
+    "released": ("td3", "sac", "td7"),
 }
 
 

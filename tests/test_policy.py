@@ -26,16 +26,22 @@ def saved(algo, directory, members=2, **settings):
     config = experiment.make_config(algo, "cheetah", hidden=(8, 8), **settings)
     agent = experiment.agent_of(config, env)
     state = jax.vmap(agent.init)(jax.random.split(jax.random.key(1), members))
+    state = jax.vmap(agent.see)(state, jnp.arange(6.0 * members).reshape(members, 3, 2))
+    if settings.get("normalize_observations") and algo.startswith("td7"):  # the saved policy is the checkpoint
+        moments = state.learner.statistics.moments
+        policies = state.checkpoints.checkpoint._replace(moments=moments)
+        state = state._replace(checkpoints=state.checkpoints._replace(checkpoint=policies))
     policy.save_policy(directory, config, env, state)
     return agent, state
 
 
-RELEASED = {f"{algo} released": preset_settings("released", algo, "cheetah") for algo in ("td3", "sac", "td7")}
+CHANGED = {f"{algo} released": preset_settings("released", algo, "cheetah") for algo in ("td3", "sac", "td7")}
+CHANGED |= {f"{algo} normalised": {"normalize_observations": True} for algo in ("td3", "sac", "td7")}
 
 
-@algorithm_rows.every([*ALGORITHMS, *RELEASED], fast=("td3", "sac", "td7_sqt", "sac released"))
+@algorithm_rows.every([*ALGORITHMS, *CHANGED], fast=("td3", "sac", "td7_sqt", "sac released", "td7 normalised"))
 def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
-    agent, state = saved(algo.split()[0], tmp_path / "policy", **RELEASED.get(algo, {}))
+    agent, state = saved(algo.split()[0], tmp_path / "policy", **CHANGED.get(algo, {}))
     obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
     for member in range(2):
         own = jax.tree.map(lambda leaf, member=member: leaf[member], state)
@@ -300,9 +306,9 @@ assert "sqt_jax" not in sys.modules and "flax" not in sys.modules
 """
 
 
-@pytest.mark.parametrize("algo", ["td3", "sac_sqt", "td7"])
+@pytest.mark.parametrize("algo", ["td3", "sac_sqt", "td7", pytest.param("sac normalised", marks=pytest.mark.slow)])
 def test_the_exported_policy_runs_without_this_package(algo, tmp_path):
-    saved(algo, tmp_path / "policy")
+    saved(algo.split()[0], tmp_path / "policy", **CHANGED.get(algo, {}))
     subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=tmp_path, check=True, timeout=120)
     obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
     expected = policy.load_policy(tmp_path / "policy", 1)(obs)

@@ -50,7 +50,7 @@ def test_a_run_resumes_on_another_number_of_devices(tmp_path):
     assert {row["env_steps"] for row in rows_of(path_in(tmp_path) / "evaluations.csv")} >= {"0", "80", "120"}
 
 
-def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
+def interrupted(out, monkeypatch, at, *more, by=signal.SIGTERM):
     """A run that gets a signal when the evaluation or the checkpoint of step `at` has been made."""
 
     sent = []
@@ -71,7 +71,7 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
             "save",
             then(checkpoints.CheckpointStore.save, lambda given: given[1].env_steps),
         )
-        assert run(out, *MEMBERS) == 130
+        assert run(out, *MEMBERS, *more) == 130
     summary = json.loads((path_in(out) / "summary.json").read_text())
     assert (summary["status"], summary["env_steps"]) == ("interrupted", at)
 
@@ -88,7 +88,7 @@ def interrupted(out, monkeypatch, at, by=signal.SIGTERM):
     ids=["at the first evaluation", "in the warm-up", "at an evaluation", "between two", "at both"],
 )
 def test_an_interrupted_run_ends_like_a_run_without_a_break(tmp_path, monkeypatch, capsys, unbroken, at, by):
-    interrupted(tmp_path, monkeypatch, at, by)
+    interrupted(tmp_path, monkeypatch, at, by=by)
     assert f"--resume={path_in(tmp_path)}" in capsys.readouterr().out
     assert resumed(tmp_path) == 0
     assert f"resuming at step {at}" in capsys.readouterr().out
@@ -99,6 +99,17 @@ def test_an_interrupted_run_ends_like_a_run_without_a_break(tmp_path, monkeypatc
     assert seconds == sorted(seconds)
     config = json.loads((path_in(tmp_path) / "config.json").read_text())
     assert [entry["env_steps"] for entry in config["resumed"]] == [at]
+
+
+@pytest.mark.parametrize("at", [pytest.param(20, marks=pytest.mark.slow), 80])
+def test_the_statistics_of_observations_are_resumed(tmp_path, monkeypatch, at):
+    """In the warm-up and in training."""
+    assert run(tmp_path / "unbroken", *MEMBERS, "--normalize_observations") == 0
+    interrupted(tmp_path, monkeypatch, at, "--normalize_observations")
+    assert resumed(tmp_path) == 0
+    results = read_results(path_in(tmp_path / "unbroken"))
+    assert differences(results, read_results(path_in(tmp_path))) == []
+    assert results["policy/member_3/moments/variance"].min() > 0.1  # of uniform observations in [-1, 1]: 1/3
 
 
 def test_the_same_command_with_resume_starts_the_run_and_resumes_it(tmp_path, monkeypatch, unbroken):

@@ -149,6 +149,9 @@ def around(config: AgentConfig, learner: Parts, explore: Callable[[Array, Array]
         checkpoints = assess(config, state.checkpoints, policy, step, episode_return[0], ended_well)
         return state._replace(checkpoints=checkpoints)
 
+    def see(state: CheckpointedState, obs: Array) -> CheckpointedState:
+        return state._replace(learner=agent.see(state.learner, obs))
+
     return assemble(
         init=init,
         act=act,
@@ -162,4 +165,5 @@ def around(config: AgentConfig, learner: Parts, explore: Callable[[Array, Array]
             status=lambda state: status(state.checkpoints) | views.status(state.learner),
         ),
         observe=observe,
+        see=see,
     )

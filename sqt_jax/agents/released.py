@@ -6,13 +6,12 @@ dimensions. In TD3 and SAC the encoder is never trained, values are not clipped 
 Each of these is a setting, named in `SETTINGS`; with all of them as in the papers, the agents are `td3`, `sac`, `td7`.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from sqt_jax.agents import policy_checkpoints, sac, td3, td7
+from sqt_jax.agents import sac, td3, td7
 from sqt_jax.config import AgentConfig
 from sqt_jax.gaussian import Gaussian
 from sqt_jax.types import Array, Metrics, Parts, Scalars, Transition
@@ -111,4 +110,4 @@ def build_sac(config: AgentConfig, observation_size: int, action_size: int) -> P
 def build_td7(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
     """TD7, its actor Gaussian if `sampled_actor`."""
     learner = _learner(config, observation_size, action_size, _td3_rules(config))
-    return policy_checkpoints.around(config, learner, functools.partial(td3.explore, config=config))
+    return td7.with_checkpoints(config, learner, observation_size)

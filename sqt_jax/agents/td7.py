@@ -15,7 +15,7 @@ import optax
 
 from sqt_jax import q_targets, sale, trees
 from sqt_jax.agents import critic as critics
-from sqt_jax.agents import policy_checkpoints, td3
+from sqt_jax.agents import normalised, policy_checkpoints, td3
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step
 from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
@@ -121,9 +121,18 @@ def lap_huber(q: Array, td_target: Array, min_priority: float) -> Array:
 
 def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts:
     """TD7 for observations [B, O] and actions [B, A]: the learner below with policy checkpoints."""
-    rules = deterministic(config)
-    learner = build_learner(config, observation_size, action_size, rules)
-    return policy_checkpoints.around(config, learner, rules.explore)
+    learner = build_learner(config, observation_size, action_size, deterministic(config))
+    return with_checkpoints(config, learner, observation_size)
+
+
+def with_checkpoints(config: AgentConfig, learner: Parts, observation_size: int) -> Parts:
+    """The learner, its observations normalised if they are to be, with policy checkpoints around it.
+
+    In this order, so that snapshot and checkpoint keep the moments that they were made with.
+    """
+    if config.normalize_observations:
+        learner = normalised.around(learner, observation_size)
+    return policy_checkpoints.around(config, learner, functools.partial(td3.explore, config=config))
 
 
 def build_learner(
