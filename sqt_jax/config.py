@@ -133,13 +133,17 @@ class Config:
 
     algo: str
     env: str
-    physics: str = setting("mjx", "the physics: mjx, mujoco or warp; brax:NAME has others")
+    physics: str = setting(
+        "mjx", "the physics: mjx, mujoco or warp; not mujoco for playground:NAME; brax:NAME has others"
+    )
     eval_physics: str = setting("auto", "the same for evaluation; auto: mujoco on a CPU, else the training's")
     env_args: str = setting(
-        "", "keyword arguments of the environment, NAME=VALUE,... (gym:ID, MODULE:FUNCTION)", default_text="none"
+        "",
+        "keyword arguments of the environment, NAME=VALUE,... (gym:ID, playground:NAME, MODULE:FUNCTION)",
+        default_text="none",
     )
     max_episode_steps: int = setting(
-        0, "time limit of its episodes (gym:ID, MODULE:FUNCTION); 0: the environment's own", low=0
+        0, "time limit of its episodes (gym:ID, playground:NAME, MODULE:FUNCTION); 0: the environment's own", low=0
     )
     agent: AgentConfig = AgentConfig()
     train: TrainConfig = TrainConfig()

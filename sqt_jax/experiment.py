@@ -9,7 +9,7 @@ import jax
 from sqt_jax import envs, lap, replay, train
 from sqt_jax.algorithms import ALGORITHMS, make_agent_config, make_parts, reject_unknown
 from sqt_jax.config import SETTINGS, AgentConfig, Config, TrainConfig, check_train
-from sqt_jax.envs import env_args
+from sqt_jax.envs import env_args, gym_ids
 from sqt_jax.ring import Ring
 from sqt_jax.settings import ConfigError, current_names, settings_of
 from sqt_jax.suggestions import expects_one_of
@@ -141,7 +141,7 @@ def named_env(config: Config, physics: str, processes: int = 0) -> Environment:
     options: dict[str, Any] = {}
     if envs.takes_arguments(config.env):
         options = {"arguments": env_args.parse(config.env_args), "max_episode_steps": config.max_episode_steps}
-        options |= {"processes": processes} if processes else {}
+        options |= {"processes": processes} if processes and physics in gym_ids.PHYSICS else {}
     return envs.make(config.env, physics, **options)
 
 

@@ -26,3 +26,8 @@ def from_paths(like: Any, leaves: dict[str, Any]) -> Any:
 def where(condition: Array, a: Any, b: Any) -> Any:
     """`a` if `condition` [] holds, else `b`: two trees of the same structure and shapes."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+def strong(tree: Any) -> Any:
+    """The same leaves as arrays without weak types: `jit` would compile once for the weak and once for the strong."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, jnp.result_type(leaf)), tree)

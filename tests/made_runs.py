@@ -50,7 +50,7 @@ def write_run(
         "settings": configs[0].flat(),
         "preset": "paper",
         "replay_rows": configs[0].train.capacity,
-        "evaluated_on": configs[0].physics if sizes or env.startswith("brax:") else "mujoco",
+        "evaluated_on": configs[0].physics if sizes or env.startswith(("brax:", "playground:")) else "mujoco",
         "swept": list(swept),
         "members": [
             {"member": index, "seed": seed, "penalty_coef": config.agent.penalty_coef}

@@ -16,13 +16,16 @@ from sqt_jax.envs.env_args import parse
         ("flag=False,none=None,also=null", {"flag": False, "none": None, "also": None}),
         ("path=/a=b,text=1,2", {"path": "/a=b", "text": "1,2"}),
         ("number=NaN,empty=", {"number": "NaN", "empty": ""}),
+        ("a.b_1.c=1,d.e=[2,3]", {"a.b_1.c": 1, "d.e": [2, 3]}),
     ],
 )
 def test_arguments(text, arguments):
     assert parse(text) == arguments
 
 
-@pytest.mark.parametrize("text", ["continuous", "=1", "1a=2", "a b=1", "a=\n", "a=" + 3000 * "x", ","])
+@pytest.mark.parametrize(
+    "text", ["continuous", "=1", "1a=2", "a b=1", "a=\n", "a=" + 3000 * "x", ",", "a..b=1", ".a=1", "a.=1", "a.1=1"]
+)
 def test_other_text(text):
     with pytest.raises(ValueError, match="expects NAME=VALUE,..."):
         parse(text)

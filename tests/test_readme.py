@@ -135,6 +135,8 @@ def test_commands_that_train_are_valid(argv, tmp_path, monkeypatch):
     if any(word.startswith("--resume=") for word in argv):  # of a run that does not exist here
         assert flags.parse(argv).resume.startswith("runs/")
         return
+    if any(word.startswith("--env=playground:") for word in argv):
+        pytest.importorskip("mujoco_playground", reason="needs the extra playground")
     options = flags.parse([*argv, f"--out={tmp_path}", "--replay_capacity=1000"])
     assert make_plan(options, own_environment(options)).members
 

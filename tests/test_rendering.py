@@ -86,3 +86,15 @@ def test_a_camera_that_the_model_does_not_have_is_rejected():
     model = load_model(TASKS["ant"])
     with pytest.raises(ValueError, match="expects one of track, not 'side'"):
         next(rendering.frames(model, [model.qpos0], camera="side"))
+
+
+def test_bodies_that_a_task_moves_itself_are_placed_after_the_joints():
+    xml = "<body mocap='true'><geom size='1'/></body><body><joint type='slide'/><geom size='1'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{xml}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    rendering.place(model, data, np.float32([0.5, 1, 2, 3, 0, 1, 0, 0]))
+    assert data.qpos == [0.5]
+    np.testing.assert_array_equal(data.mocap_pos, [[1, 2, 3]])
+    np.testing.assert_array_equal(data.mocap_quat, [[0, 1, 0, 0]])
+    rendering.place(model, data, np.float32([0.25]))
+    assert data.qpos == [0.25] and data.mocap_pos[0, 0] == 1

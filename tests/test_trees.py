@@ -37,3 +37,9 @@ def test_where_selects_one_of_two_trees(condition):
     chosen = trees.where(jnp.array(condition), a, b)
     for name, leaf in (a if condition else b).items():
         np.testing.assert_array_equal(chosen[name], leaf)
+
+
+def test_strong_leaves_are_arrays_without_weak_types():
+    tree = trees.strong({"a": 1.0, "b": jnp.asarray(2), "c": jnp.float32(1) * 2, "d": np.int64(3), "e": True})
+    assert [leaf.dtype.name for leaf in tree.values()] == ["float32", "int32", "float32", "int32", "bool"]
+    assert not any(leaf.weak_type for leaf in tree.values())

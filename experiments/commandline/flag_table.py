@@ -167,8 +167,9 @@ def _flags() -> dict[str, list[Flag]]:
                 parse=str,
                 expects="a name",
                 help="environment: cheetah, walker, ant, humanoid, hopper, swimmer or humanoid_standup (Gymnasium's "
-                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own; gym:ID: any environment that Gymnasium "
-                "makes; MODULE:FUNCTION: your function that returns a sqt_jax.Environment or a gymnasium.Env",
+                "v4); NAME-v5 for its v5; brax:ant and others for Brax's own; playground:NAME for MuJoCo Playground's; "
+                "gym:ID: any environment that Gymnasium makes; MODULE:FUNCTION: your function that returns a "
+                "sqt_jax.Environment or a gymnasium.Env",
                 default="required",
             ),
             *_group(settings_of(Config).values(), None),

@@ -38,7 +38,7 @@ def parser() -> Parser:
     add("--start_seed", type=between(0, MAX_SEED), default=0, metavar="N", help="seed of the initial states (0)")
     imports = "of a run on MODULE:FUNCTION or gym:MODULE:ID, the same again: its module is imported"
     add("--env", metavar="NAME", help=imports)
-    add("--physics", metavar="NAME", help="physics of the episodes (mujoco; for brax:ENV the run's)")
+    add("--physics", metavar="NAME", help="physics of the episodes (mujoco; for brax:ENV, playground:ENV the run's)")
     add("--video", type=film, metavar="FILE", help="write a film: .mp4, .gif or .html; for brax:ENV only .html")
     add("--size", type=size, metavar="WIDTHxHEIGHT", help="size of the film in pixels (640x480)")
     add("--camera", default="", metavar="NAME", help="one of the model's cameras (the one that follows the robot)")

@@ -23,9 +23,10 @@ def cameras(model: mujoco.MjModel) -> list[str]:
 def frames(
     model: mujoco.MjModel, configurations: Iterable[np.ndarray], size: Sequence[int] = (640, 480), camera: str = ""
 ) -> Iterator[np.ndarray]:
-    """One picture [height, width, 3] uint8 per configuration qpos [nq]; each is a new array.
+    """One picture [height, width, 3] uint8 per configuration; each is a new array.
 
     Args:
+      configurations: as in `place`.
       size: width and height in pixels.
       camera: the name of one of the model's `cameras`; empty: `TRACKING`, or a free one that follows the robot.
 
@@ -39,11 +40,22 @@ def frames(
     model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, SHADOW_TEXELS)
     data = mujoco.MjData(model)
     with mujoco.Renderer(model, height, width) as renderer:
-        for qpos in configurations:
-            data.qpos[:] = qpos
+        for configuration in configurations:
+            place(model, data, configuration)
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, view)
             yield renderer.render().copy()
+
+
+def place(model: mujoco.MjModel, data: mujoco.MjData, configuration: np.ndarray) -> None:
+    """Sets qpos [nq], and the bodies that a task moves itself (mocap), such as a target: [nq] or [nq + 7 nmocap].
+
+    After qpos come the positions of all these bodies, then their quaternions.
+    """
+    parts = mujoco.mjtState.mjSTATE_QPOS
+    if len(configuration) > model.nq:
+        parts |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+    mujoco.mj_setState(model, data, np.asarray(configuration, np.float64), parts)
 
 
 def view_of(model: mujoco.MjModel, camera: str = "") -> mujoco.MjvCamera:

@@ -25,7 +25,7 @@ def show(
     """Shows episodes one after another, in a loop, until the user closes the window.
 
     Args:
-      episodes: qpos [T, nq] and qvel [T, nv] of each.
+      episodes: of each, T configurations as in `rendering.place`, and qvel [T, nv].
       period: seconds between two states.
       camera: the name of one of the model's cameras; empty: one that follows the robot and can be turned by hand.
       launch: opens the window; None is `mujoco.viewer.launch_passive`.
@@ -65,9 +65,10 @@ def _run(
             setattr(window.cam, name, getattr(view, name))
     due = clock()
     while window.is_running():
-        for qpos, qvel in (state for episode in episodes for state in zip(*episode, strict=True)):
+        for configuration, qvel in (state for episode in episodes for state in zip(*episode, strict=True)):
             with window.lock():
-                data.qpos[:], data.qvel[:] = qpos, qvel
+                rendering.place(model, data, configuration)
+                data.qvel[:] = qvel
                 mujoco.mj_forward(model, data)
             window.sync()
             due += period

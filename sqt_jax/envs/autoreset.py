@@ -139,12 +139,23 @@ def make_environment(
         return first_timestep(*begin(start_key), next_key, start_key)
 
     def restart(old: tuple[EpisodeState, Array], _: Any) -> tuple[EpisodeState, Array]:
-        episode, _ = old
+        episode, last_obs = old
         start_key, next_key = jax.random.split(episode.key)
-        begun = begin(start_key)
-        finite = jnp.all(in_range(begun[1]))
-        # Computed again, and rarely: a second state of the task would be carried through all steps.
-        task, obs = cond_if_any(~finite, lambda _, key: begin(key), begun, given=episode.start_key)
+
+        # The second attempt computes the last finite start again, and is rare: a second state of the task would be
+        # carried through all steps. A loop, because two calls of `begin` would be compiled twice.
+        def attempt(made: tuple[Array, Array, State, Array]) -> tuple[Array, Array, State, Array]:
+            attempts, *_ = made
+            task, obs = begin(jnp.where(attempts == 0, start_key, episode.start_key))
+            return attempts + 1, jnp.all(in_range(obs)), task, obs
+
+        def goes_on(made: tuple[Array, Array, State, Array]) -> Array:
+            attempts, finite, *_ = made
+            return (attempts < 2) & ~finite
+
+        none = jnp.zeros((), jnp.int32), jnp.zeros((), bool), episode.task, last_obs
+        attempts, _, task, obs = jax.lax.while_loop(goes_on, attempt, none)
+        finite = attempts == 1
         state = EpisodeState(
             task=task,
             steps=jnp.zeros((), jnp.int32),

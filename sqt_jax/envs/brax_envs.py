@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sqt_jax import trees
 from sqt_jax.envs.autoreset import MIN_STEPS_TO_FALL, make_environment
 from sqt_jax.types import Array, Environment
 
@@ -53,12 +54,12 @@ def make_brax(name: str, physics: str) -> Environment:
 
     def start(key: Array) -> tuple[Any, Array]:
         with jax.default_matmul_precision("highest"):  # GPUs would use TF32
-            state = _strong(env.reset(key))
+            state = trees.strong(env.reset(key))
         return state, state.obs
 
     def advance(state: Any, action: Array) -> tuple[Any, Array, Array, Array]:
         with jax.default_matmul_precision("highest"):
-            state = _strong(env.step(state, action))
+            state = trees.strong(env.step(state, action))
         return state, state.obs, state.reward, state.done > 0
 
     shortest = MIN_STEPS_TO_FALL if name in FALLING else 1 if name in PENDULUMS else EPISODE_LENGTH
@@ -82,8 +83,3 @@ def brax_own(name: str, physics: str) -> Any:
         # Brax 0.14's fluid forces (the swimmer's) call `clip(x, a_min=...)`, which JAX 0.10 no longer accepts.
         fluid.jp = SimpleNamespace(**vars(jnp) | {"clip": lambda x, a_min: jnp.maximum(x, a_min)})
         return envs.get_environment(name.removeprefix(PREFIX), backend=physics)
-
-
-def _strong(tree: Any) -> Any:
-    """The same leaves without weak types: `jit` would compile once for the weak and once for the strong type."""
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, jnp.result_type(leaf)), tree)
