@@ -49,10 +49,15 @@ def test_a_sweep_uses_the_devices_that_get_members(monkeypatch, here, count, use
     assert Layout(count, (jax.devices()[0],) * used).padded_size - count < math.ceil(count / used)
 
 
+def learner_of(state):
+    """The agent's state; TD7's is inside its policy checkpoints."""
+    return getattr(state.agent, "learner", state.agent)
+
+
 def trained(sweep, config, count):
     """The actors at the start, and the state after a little training."""
     start = one_of_two_processes.start(sweep, config, count)
-    first = jax.device_get(start.agent.actor)
+    first = jax.device_get(learner_of(start).actor)
     return first, one_of_two_processes.train_a_little(sweep, start)
 
 
@@ -93,7 +98,7 @@ def test_members_train_on_two_devices_as_on_one(both):
 @two_devices
 def test_each_device_holds_only_its_share(both):
     _, (_, (_, state)) = both
-    for leaf in jax.tree.leaves((state.agent.actor, state.replay)):
+    for leaf in jax.tree.leaves((learner_of(state).actor, state.replay)):
         if not leaf.ndim:
             continue  # a shared counter
         assert {shard.device for shard in leaf.addressable_shards} == set(DEVICES)
