@@ -58,7 +58,11 @@ def test_final_table_has_the_members_and_the_groups(console):
 def test_an_interrupted_run_ends_with_the_command_that_resumes_it(console, tmp_path, quiet):
     path = tmp_path / "a run"
     plan = SimpleNamespace(
-        path=path, own_env=None, output={"checkpoint_every": 20}, options=SimpleNamespace(quiet=quiet)
+        path=path,
+        own_env=None,
+        config=SimpleNamespace(env="ant"),
+        output={"checkpoint_every": 20},
+        options=SimpleNamespace(quiet=quiet),
     )
     outcome = SimpleNamespace(interrupted=True, wall_seconds=83.0, steps_per_second=1234.0)
     Announcer(console, plan).end(outcome, SUMMARY, [], curves=True)
@@ -77,13 +81,22 @@ def test_an_interrupted_run_ends_with_the_command_that_resumes_it(console, tmp_p
     ("env", "command"),
     [
         ("my_tasks:make", "python -m experiments.run --resume=a --env=my_tasks:make"),
+        ("gym:my_tasks:Mine-v0", "python -m experiments.run --resume=a --env=gym:my_tasks:Mine-v0"),
+        ("gym:Pendulum-v1", "python -m experiments.run --resume=a"),
         ("point", "experiments.run.main(['run', '--resume=a'], env=env)"),  # handed in, and named
         (None, "experiments.run.main(['run', '--resume=a'], env=env)"),
     ],
 )
 def test_a_run_on_ones_own_environment_is_resumed_with_it(console, env, command):
     options = SimpleNamespace(quiet=False, env=env)
-    plan = SimpleNamespace(path="a", own_env=object(), output={"checkpoint_every": 20}, options=options)
+    is_gym = (env or "").startswith("gym:")
+    plan = SimpleNamespace(
+        path="a",
+        own_env=None if is_gym else object(),
+        config=SimpleNamespace(env=env if is_gym else "point"),
+        output={"checkpoint_every": 20},
+        options=options,
+    )
     outcome = SimpleNamespace(interrupted=True, wall_seconds=83.0, steps_per_second=None)
     Announcer(console, plan).end(outcome, SUMMARY, [], curves=False)
     assert console.file.getvalue().splitlines()[-1] == f"resume with: {command}"

@@ -13,6 +13,7 @@ from absl.testing import flagsaver
 
 from experiments import bench, play, plots, report, run, tables
 from experiments.commandline import flag_table, flags
+from experiments.commandline.arguments import UsageError
 from experiments.run import own_environment
 from experiments.running.plan import make_plan
 
@@ -138,7 +139,12 @@ def test_commands_that_train_are_valid(argv, tmp_path, monkeypatch):
     if any(word.startswith("--env=playground:") for word in argv):
         pytest.importorskip("mujoco_playground", reason="needs the extra playground")
     options = flags.parse([*argv, f"--out={tmp_path}", "--replay_capacity=1000"])
-    assert make_plan(options, own_environment(options)).members
+    try:
+        assert make_plan(options, own_environment(options)).members
+    except UsageError as error:
+        if "DependencyNotInstalled" not in str(error):
+            raise
+        pytest.skip(str(error))  # of the extra `tasks`
 
 
 @pytest.mark.parametrize("argv", SWEEPS, ids=ids)
