@@ -161,7 +161,8 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
             make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
-        jax_settings.start_jax(options.devices or len(configs) * len(options.seeds))
+        on_host = env.host if env else default.physics in gym_ids.PHYSICS
+        jax_settings.start_jax(1 if on_host else options.devices or len(configs) * len(options.seeds))
         if env is None:
             check_physics(configs[0])
     except ConfigError as error:
@@ -179,7 +180,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         # A new run: one command both starts a run and resumes it.
         return _Target(members=members, swept=swept, path=path, resumed=None)
     else:
-        run = resume.check(path, resume.read(path), wanted, options.devices)
+        run = resume.check(path, resume.read(path), wanted, 1 if env and env.host else options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
@@ -207,7 +208,7 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
             wanted["env"] = envs.resolve(options.env)
         except ValueError as error:
             raise UsageError(f"--env: {error}") from None
-    run = resume.check(path, run, wanted, options.devices)
+    run = resume.check(path, run, wanted, 1 if env and env.host else options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
