@@ -37,7 +37,9 @@ def main(argv: Sequence[str]) -> int:
             _say(*(repeat_command(cell) for cell in cells if needs_training(cell)))
             return DONE
         reject_folder("--out", out)
-        launcher = make_launcher(LauncherOptions(launcher=FLAGS.launcher, workers=FLAGS.workers, out=out))
+        launcher = make_launcher(
+            LauncherOptions(launcher=FLAGS.launcher, workers=FLAGS.workers, out=out, ray=FLAGS.ray)
+        )
         with collected_signals() as received:
             return train_cells(
                 cells,
@@ -78,6 +80,7 @@ if __name__ == "__main__":
     define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/. On a cluster: a folder that all machines share.")
     flags.DEFINE_string("launcher", "local", f"Where runs are started: {', '.join(LAUNCHERS)}.")
     flags.DEFINE_integer("workers", None, "With local: runs side by side, each on GPUs or cores of its own.", 1)
+    flags.DEFINE_string("ray", None, "With ray: resources of a run, as num_cpus=2,num_gpus=1,resources.NAME=1.")
     flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
     flags.DEFINE_bool("fail_fast", False, "Stop at the first run that fails.")
     flags.DEFINE_bool("status", False, "Print the state of the grid's runs and train nothing.")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.commandline.arguments import UsageError
-from experiments.launchers import local
+from experiments.launchers import local, ray_cluster
 from experiments.launchers.launcher import Launcher
 from sqt_jax.suggestions import expects_one_of
 
@@ -16,6 +16,7 @@ class LauncherOptions(NamedTuple):
     launcher: str
     workers: int | None  # local
     out: Path
+    ray: str | None = None  # ray
 
 
 class Kind(NamedTuple):
@@ -27,6 +28,7 @@ class Kind(NamedTuple):
 
 LAUNCHERS = {
     "local": Kind(lambda options: local.make(options.workers or 1), ("workers",)),
+    "ray": Kind(lambda options: ray_cluster.make(options.ray or "", options.out), ("ray",)),
 }
 
 
