@@ -45,11 +45,12 @@ def folder(finished, tmp_path, monkeypatch):
 
 
 def snapshot(path):
-    """The contents of a folder: names, bytes and the targets of links."""
+    """The contents of a folder: names, bytes and the targets of links. Of a lock only that it is a file."""
     found = {}
     for item in path.rglob("*"):
         link = item.readlink() if item.is_symlink() else None
-        found[item.relative_to(path)] = link or (item.read_bytes() if item.is_file() else "folder or device")
+        content = "folder or device" if not item.is_file() else "lock" if item.name == "lock" else item.read_bytes()
+        found[item.relative_to(path)] = link or content
     return found
 
 
@@ -425,8 +426,7 @@ def test_a_file_at_the_path_of_a_run_is_not_replaced(folder, capsys):
 HOLD = """
 import sys, pathlib
 from experiments.running import folder_lock
-slow = folder_lock.Timing(beat=100, settle=100)  # the record stays as it is
-with folder_lock.locked(pathlib.Path(sys.argv[1]), timing=slow):
+with folder_lock.locked(pathlib.Path(sys.argv[1])):
     print("locked", flush=True)
     sys.stdin.read()
 """

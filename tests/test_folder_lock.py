@@ -105,6 +105,7 @@ def test_a_killed_process_keeps_nobody_out_on_its_host(tmp_path, hold):
         pass
     assert busy.value.holder.process == process.pid
     assert str(busy.value) == f"host {busy.value.holder.host}, process {process.pid}"
+    assert record(tmp_path / "run").token == busy.value.holder.token  # it keeps the lock
     kill(process)
     began = time.monotonic()
     with locked(tmp_path / "run", pytest.fail, timing=Timing(FOREVER, FOREVER, FOREVER, FOREVER)):
