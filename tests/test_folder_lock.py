@@ -204,14 +204,14 @@ def test_a_holder_that_was_succeeded_ends(tmp_path, hold, local_flock):
     process.send_signal(signal.SIGSTOP)
     with locked(tmp_path / "run", host="a", timing=Timing(0.1, 0.5, FOREVER, 0.1), lost=pytest.fail):
         process.send_signal(signal.SIGCONT)
-        out, err = process.communicate(timeout=20)
-        assert process.returncode == 130
+        assert process.wait(timeout=60) == 130
+        out, err = process.communicate()
         taker = f"host a, process {os.getpid()}"
         assert (out, err) == ("", f"{tmp_path / 'run'}: {taker} has taken over this run; this process ends\n")
         assert record(tmp_path / "run").host == "a"
 
 
-@pytest.mark.parametrize("content", [b"12345\n", b"\0", *DAMAGED[-2:]])
+@pytest.mark.parametrize("content", [b"12345\n", b"\0", b"x" * 5000, *DAMAGED[-2:]])
 def test_a_damaged_record_is_watched_first(tmp_path, content):
     (tmp_path / "lock").write_bytes(content)
     lines = []
@@ -311,7 +311,7 @@ def test_of_many_that_race_one_goes_on(tmp_path, local_flock):
 
 
 def test_a_later_attempt_awaits_the_lock_of_an_earlier_one(tmp_path, hold, monkeypatch):
-    process = hold(SQT_JOB="ray:7")
+    process = hold("b", SQT_JOB="ray:7")
     monkeypatch.setenv("SQT_JOB", "ray:7")
     lines = []
 
@@ -319,7 +319,7 @@ def test_a_later_attempt_awaits_the_lock_of_an_earlier_one(tmp_path, hold, monke
         lines.append(line)
         threading.Timer(0.2, process.kill).start()
 
-    with locked(tmp_path / "run", end, timing=Timing(0.1, 0.5, FOREVER, FOREVER)):
+    with locked(tmp_path / "run", end, host="a", timing=Timing(0.1, 0.5, FOREVER, FOREVER)):
         assert record(tmp_path / "run").process == os.getpid()
     assert len(lines) == 1 and f"process {process.pid}, job ray:7, an earlier attempt at this job" in lines[0]
 

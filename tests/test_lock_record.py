@@ -83,7 +83,8 @@ def test_the_job_is_named_as_its_engine_names_it(variables, job, text):
 @pytest.mark.parametrize(
     ("later", "earlier", "succeeds"),
     [
-        ({}, {}, False),  # no jobs
+        ({}, {}, False),
+        ({"SLURM_RESTART_COUNT": "1"}, {}, False),  # no jobs
         (SLURM | {"SLURM_RESTART_COUNT": "1"}, SLURM, True),  # requeued
         (SLURM, SLURM, False),  # a second process of the same attempt
         (SLURM | {"SLURM_RESTART_COUNT": "1"}, SLURM | {"SLURM_ARRAY_TASK_ID": "3"}, False),
