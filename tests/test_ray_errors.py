@@ -35,7 +35,7 @@ def test_the_reason_and_whether_it_is_tried_again(error, code, reason, lost):
 
 def test_a_task_that_was_cancelled_by_force_had_started():
     error = exceptions.TaskCancelledError()
-    assert ended_by(error, CELL, forced=True) == Ended(CELL, INTERRUPTED, "killed")
+    assert ended_by(error, CELL, forced=True) == Ended(CELL, FAILED, "killed", lost=True)
 
 
 @pytest.mark.parametrize("error", [exceptions.LocalRayletDiedError(), exceptions.RaySystemError("GCS is gone")])

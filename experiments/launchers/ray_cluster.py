@@ -74,8 +74,9 @@ class RayLauncher:
             folder=os.getcwd(),
         )
         name = f"RAY_ADDRESS={self._address}" if self._address else "--launcher=ray"
+        what = "a Ray cluster that this machine belongs to" if self._address else "to start a Ray cluster"
         seconds = CONNECT_SECONDS if self._address else START_SECONDS
-        _wait_for("connected", driver, seconds, f"{name}: expects a Ray cluster; none answers within {seconds:.0f} s")
+        _wait_for("connected", driver, seconds, f"{name}: expects {what}; none answers within {seconds:.0f} s")
         _wait_for("ready", driver, READY_SECONDS, f"{name}: its nodes do not answer within {READY_SECONDS:.0f} s")
         return driver
 

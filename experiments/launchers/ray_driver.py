@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from experiments.commandline.arguments import FAILED, UsageError
 from experiments.launchers import ray_errors
-from experiments.launchers.cell import Cell
+from experiments.launchers.cell import Cell, write_ended
 from experiments.launchers.local import visible_gpus
 from experiments.launchers.ray_options import RayOptions
 from sqt_jax.job_limits import usable_cores
@@ -186,6 +187,9 @@ class Tasks:
                 ended = ray.get(reference)
             except ray.exceptions.RayError as error:
                 ended = ray_errors.ended_by(error, cell, forced=self._cancels > 1)
+                if ended.lost:  # its process could not say so
+                    with suppress(OSError):
+                        write_ended(ended)
             self._tell(ended=[number, ended.code, ended.reason, ended.lost])
         if time.monotonic() - self._looked > LOOK_SECONDS:
             self._give_up_without_nodes()

@@ -26,7 +26,7 @@ def ended_by(error: Exception, cell: Cell, forced: bool = False) -> Ended:
     if isinstance(error, exceptions.LocalRayletDiedError | exceptions.RaySystemError):
         raise ClusterLost(one_line(error)) from error
     if isinstance(error, exceptions.TaskCancelledError):
-        return Ended(cell, INTERRUPTED, "killed" if forced else "not started")
+        return Ended(cell, FAILED, "killed", lost=True) if forced else Ended(cell, INTERRUPTED, "not started")
     if isinstance(error, exceptions.WorkerCrashedError):
         return Ended(cell, FAILED, "its Ray worker died", lost=True)
     if isinstance(error, exceptions.NodeDiedError):
