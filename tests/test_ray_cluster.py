@@ -19,6 +19,7 @@ from experiments.launchers.cell import Cell, Ended, write_ended
 from experiments.launchers.ray_cluster import RayLauncher, forwarded_variables, make
 from experiments.launchers.ray_options import RayOptions
 
+BELONGS = "expects a Ray cluster that this machine belongs to"
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = [Cell(str(index), "td3", Path("out") / str(index), ("--steps=5",)) for index in range(3)]
 START = """
@@ -121,7 +122,7 @@ def test_a_lost_cluster_ends_all_cells(launch, end, why):
         ('raise ValueError("wrong")', "--launcher=ray: Ray ended: ValueError: wrong"),
         (
             "time.sleep(600)",
-            "RAY_ADDRESS=10.0.0.7:6379: expects a Ray cluster that this machine belongs to; none answers within 1 s",
+            f"RAY_ADDRESS=10.0.0.7:6379: {BELONGS}; none answers within 1 s",
         ),
         ("tell(connected=True); time.sleep(600)", "RAY_ADDRESS=10.0.0.7:6379: its nodes do not answer within 1 s"),
     ],
@@ -295,7 +296,7 @@ def test_a_cluster_of_its_own_ends_with_the_sweep(tmp_path):
         (
             "",
             "127.0.0.1:1",
-            "RAY_ADDRESS=127.0.0.1:1: expects a Ray cluster that this machine belongs to; none answers within 20 s\n",
+            f"RAY_ADDRESS=127.0.0.1:1: {BELONGS}; none answers within 20 s\n",
         ),
         ("", "nonsense", "RAY_ADDRESS=nonsense: expects a Ray cluster: Invalid address format: nonsense\n"),
     ],
