@@ -91,7 +91,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     used_env = env or _named_env(config, output["env_processes"])
     if used_env.host is None and options.env_processes:
         raise UsageError(f"--env_processes: has no effect with {config.env}; expects an environment of Gymnasium's")
-    if used_env.host:
+    if used_env.host and used_env.host.processes:
         output["devices"] = _one_device(options.devices)
     layout = _layout(count, output["devices"], typed=options.devices is not None)
     needed, (free, where) = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
@@ -123,7 +123,7 @@ def _named_env(config: Config, processes: int) -> Environment:
 
 def _one_device(given: int | None) -> int:
     if given not in (None, 1):
-        raise UsageError(f"--devices={given}: expects 1 with an environment on the host: all members share one call")
+        raise UsageError(f"--devices={given}: expects 1 with --env_processes: all members share the processes")
     return 1
 
 
@@ -161,8 +161,8 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
             make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
             for values in product(*options.sweep.values())
         ]
-        on_host = env.host if env else default.physics in gym_ids.PHYSICS
-        jax_settings.start_jax(1 if on_host else options.devices or len(configs) * len(options.seeds))
+        in_processes = env.host and env.host.processes if env else options.env_processes
+        jax_settings.start_jax(1 if in_processes else options.devices or len(configs) * len(options.seeds))
         if env is None:
             check_physics(configs[0])
     except ConfigError as error:
@@ -180,7 +180,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         # A new run: one command both starts a run and resumes it.
         return _Target(members=members, swept=swept, path=path, resumed=None)
     else:
-        run = resume.check(path, resume.read(path), wanted, 1 if env and env.host else options.devices)
+        run = resume.check(path, resume.read(path), wanted, options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
@@ -208,7 +208,7 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
             wanted["env"] = envs.resolve(options.env)
         except ValueError as error:
             raise UsageError(f"--env: {error}") from None
-    run = resume.check(path, run, wanted, 1 if env and env.host else options.devices)
+    run = resume.check(path, run, wanted, options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
