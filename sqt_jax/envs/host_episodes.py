@@ -7,6 +7,7 @@ found out, and a call that is made twice is answered twice, not played twice.
 import queue
 import threading
 import traceback
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -38,13 +39,15 @@ class Episodes:
         self.error: HostError | None = None  # the first exception; from then on nothing is played
         self._last: tuple[bytes, np.ndarray] | None = None  # the last call's words, and its answer
         self._thread = PlayingThread()
+        weakref.finalize(self, self._thread.end).atexit = False  # the thread ends with the process
 
     def start(self, words: np.ndarray) -> np.ndarray:
         """New episodes in all rows: words of keys [..., 3] uint32 -> [..., call words, failed, packed row]."""
         rows = words.reshape(-1, KEY_WORDS)
+        failed = self.error is not None  # then its environments, and their processes, may not be usable
 
         def play() -> np.ndarray:
-            if self.rows is None or self.count != len(rows):
+            if self.rows is None or self.count != len(rows) or failed:
                 self._close_rows()
                 self.rows, self.count = self.make_rows(len(rows)), len(rows)
             return self.rows.start(rows)
@@ -108,7 +111,7 @@ class WorkerError(Exception):
 
 
 class PlayingThread:
-    """A thread that runs one function after another, and ends with the process."""
+    """A thread that runs one function after another, until `end` or with the process."""
 
     def __init__(self) -> None:
         self.todo: queue.SimpleQueue = queue.SimpleQueue()
@@ -125,13 +128,17 @@ class PlayingThread:
             raise error
         return result
 
+    def end(self) -> None:
+        """Ends the thread after what it does now."""
+        self.todo.put(None)
+
     def _serve(self) -> None:
-        while True:
-            work = self.todo.get()
+        while (work := self.todo.get()) is not None:
             try:
                 self.done.put((work(), None))
             except BaseException as error:
                 self.done.put((None, error))
+            del work  # it holds the episodes, which nobody else may need any more
 
 
 def host_error(error: BaseException) -> HostError:
