@@ -24,14 +24,16 @@ def own_environment(options: flags.Options) -> Environment | None:
     name = options.env or ""
     if not factories.is_factory(name):
         return None
-    settings = dict(options.settings)
+    settings, processes = dict(options.settings), options.env_processes
     if options.resume not in (None, flags.LATEST):
         with suppress(run_config.InvalidRunConfig):  # reported later
-            settings = run_config.read(Path(options.resume)).content["settings"] | settings
-    steps, processes = settings.get("max_episode_steps", 0), options.env_processes or 0
+            content = run_config.read(Path(options.resume)).content
+            settings = content["settings"] | settings
+            processes = content["output"].get("env_processes") if processes is None else processes
+    steps = settings.get("max_episode_steps", 0)
     try:
         arguments = env_args.parse(settings.get("env_args", ""))
-        return factories.make_from(name, arguments, steps, processes)
+        return factories.make_from(name, arguments, steps, processes if isinstance(processes, int) else 0)
     except ValueError as error:
         raise UsageError(f"--env={name}: {error}") from error
 

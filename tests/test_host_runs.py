@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -20,6 +21,7 @@ from host_tasks import Counter
 
 import sqt_jax
 from experiments import play, report, run, tables
+from experiments.commandline import flags
 from sqt_jax.envs.gym_ids import from_gymnasium
 from sqt_jax.experiment import make_trainer
 from sqt_jax.members import Layout
@@ -40,11 +42,13 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "runs/gym-host_tasks-Counter-v0/td3_sqt"
 
 
-@pytest.mark.filterwarnings("ignore:.*Overriding environment")
-def test_a_run_its_tables_its_report_and_its_film(folder, capsys):
-    assert run_tiny("--name=a", "--env_args=bad_above=0.9") == 0
+@pytest.mark.filterwarnings("ignore:.*Overriding environment", "ignore:an environment could not be closed")
+def test_a_run_its_tables_its_report_and_its_film(folder, tmp_path, capsys):
+    assert run_tiny("--name=a", "--env_args=bad_above=0.9,unruly=true") == 0
+    os.chdir(tmp_path)  # the environment has left it
+    assert " starts of gym:host_tasks:Counter-v0 had an observation" in capsys.readouterr().out
     content = json.loads((folder / "a/config.json").read_text())
-    assert content["settings"]["env"] == COUNTER and content["settings"]["env_args"] == "bad_above=0.9"
+    assert content["settings"]["env"] == COUNTER and content["settings"]["env_args"] == "bad_above=0.9,unruly=true"
     assert content["settings"]["physics"] == content["evaluated_on"] == "gymnasium"
     with (folder / "a/metrics.csv").open() as file:
         last = [*csv.DictReader(file)][-1]
@@ -54,13 +58,14 @@ def test_a_run_its_tables_its_report_and_its_film(folder, capsys):
     assert tables.main(["tables", "runs"]) == 0 and report.main(["report", "runs", "--out=r.html"]) == 0
     assert "host_tasks" not in sys.modules  # a file's names are not imported
     printed, page = capsys.readouterr().out, Path("r.html").read_text()
-    assert COUNTER in printed and COUNTER in page and "bad_above=0.9" in page
+    assert COUNTER in printed and COUNTER in page and "bad_above=0.9,unruly=true" in page
     assert play.main(["play", str(folder / "a")]) == 2
     assert "imports a module" in capsys.readouterr().err and "host_tasks" not in sys.modules
     arguments = ["play", str(folder / "a"), f"--env={COUNTER}", "--episodes=2", "--video=film.gif"]
     assert play.main(arguments) == 0
     printed = capsys.readouterr().out
     assert printed.count("return ") == 2 and "film.gif: 22x16" in printed  # 21x15 pixels, padded
+    assert (tmp_path / "film.gif").exists()
 
 
 @pytest.mark.parametrize(("devices", "saved"), [(1, 136), (2, 100)])
@@ -73,13 +78,28 @@ def test_an_exception_ends_the_run_with_its_error_and_a_checkpoint(folder, capsy
         f"--env={COUNTER}: RuntimeError: the simulator is gone; traceback: runs/gym-host_tasks-Counter-v0/td3_sqt/a/"
         f"error.txt; the last checkpoint is of step {saved}"
     )
-    assert "in step\n" in (folder / "a/error.txt").read_text()
+    assert "in step\n" in (error := (folder / "a/error.txt").read_text()) and "UTF-8: \\udcff" in error
     assert json.loads((folder / "a/summary.json").read_text())["status"] == "interrupted"
     # New environments have 136 steps more until the next exception.
     assert run.main(["run", f"--resume={folder / 'a'}"]) == 2
     assert "imports the module host_tasks" in capsys.readouterr().err
     assert run.main(["run", f"--resume={folder / 'a'}", f"--env={COUNTER}"]) == 0
-    assert "new episodes begin" in capsys.readouterr().out
+    assert "new episodes begin" in capsys.readouterr().out and not (folder / "a/error.txt").exists()
+
+
+def test_a_resumed_run_on_a_function_keeps_its_arguments_and_processes(monkeypatch):
+    content = {
+        "settings": {"env_args": "seconds=0.5", "max_episode_steps": 7},
+        "output": {"env_processes": 3},
+    }
+    monkeypatch.setattr(run.run_config, "read", lambda path: SimpleNamespace(content=content))
+    monkeypatch.setattr(run.factories, "make_from", lambda *arguments: arguments)
+
+    def made(*more):
+        return run.own_environment(flags.parse(["run", "--resume=x", "--env=host_tasks:counter", *more]))
+
+    assert made() == ("host_tasks:counter", {"seconds": 0.5}, 7, 3)
+    assert made("--env_processes=0") == ("host_tasks:counter", {"seconds": 0.5}, 7, 0)
 
 
 @pytest.mark.slow

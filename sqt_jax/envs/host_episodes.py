@@ -7,6 +7,7 @@ found out, and a call that is made twice is answered twice, not played twice.
 import queue
 import threading
 import traceback
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -27,8 +28,9 @@ class DeviceEpisodes:
 
     def __init__(self, make_rows: Callable[[int], Rows], observation_size: int, action_size: int):
         self.observation_size = observation_size
-        self._thread, self._lock = PlayingThread(), threading.Lock()
-        self._make = lambda: Episodes(make_rows, observation_size, action_size, self._thread)
+        thread, self._lock = PlayingThread(), threading.Lock()
+        weakref.finalize(self, thread.end).atexit = False  # the thread ends with the process
+        self._make = lambda: Episodes(make_rows, observation_size, action_size, thread)
         self._devices: dict[int, Episodes] = {}
         self.out_words = self._make().out_words
 
@@ -88,9 +90,10 @@ class Episodes:
     def start(self, words: np.ndarray) -> np.ndarray:
         """New episodes in all rows: words of keys [..., 3] uint32 -> [..., call words, failed, packed row]."""
         rows = words.reshape(-1, KEY_WORDS)
+        failed = self.error is not None  # then its environments, and their processes, may not be usable
 
         def play() -> np.ndarray:
-            if self.rows is None or self.count != len(rows):
+            if self.rows is None or self.count != len(rows) or failed:
                 self._close_rows()
                 self.rows, self.count = self.make_rows(len(rows)), len(rows)
             return self.rows.start(rows)
@@ -157,7 +160,7 @@ class WorkerError(Exception):
 
 
 class PlayingThread:
-    """A thread that runs one function after another, and ends with the process."""
+    """A thread that runs one function after another, until `end` or with the process."""
 
     def __init__(self) -> None:
         self.todo: queue.SimpleQueue = queue.SimpleQueue()
@@ -174,13 +177,17 @@ class PlayingThread:
             raise error
         return result
 
+    def end(self) -> None:
+        """Ends the thread after what it does now."""
+        self.todo.put(None)
+
     def _serve(self) -> None:
-        while True:
-            work = self.todo.get()
+        while (work := self.todo.get()) is not None:
             try:
                 self.done.put((work(), None))
             except BaseException as error:
                 self.done.put((None, error))
+            del work  # it holds the episodes, which nobody else may need any more
 
 
 def host_error(error: BaseException) -> HostError:
