@@ -2,7 +2,6 @@
 
 import dataclasses
 from datetime import UTC, datetime
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -159,7 +158,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         settings = preset | options.settings
         configs = [
             make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
-            for values in product(*options.sweep.values())
+            for values in options.configurations
         ]
         on_host = env.host if env else default.physics in gym_ids.PHYSICS
         jax_settings.start_jax(1 if on_host else options.devices or len(configs) * len(options.seeds))
@@ -189,6 +188,8 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
     assert options.resume
     path = Path(options.resume)
     wanted: dict[str, Any] = options.settings | options.sweep
+    if len(options.sweep) > 1:
+        wanted |= run_config.swept_lists([*options.sweep], options.configurations)
     wanted |= {"algo": options.algo} if options.algo else {}
     wanted |= {"seeds": options.seeds} if options.seeds is not None else {}
     run = resume.read(path)
@@ -246,7 +247,7 @@ def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
 
 def _default_name(options: flags.Options) -> str:
     changed: dict[str, Any] = {} if options.preset == "paper" else {"preset": options.preset}
-    changed |= options.settings | options.sweep
+    changed |= options.settings | options.sweep | ({"paired": True} if options.paired else {})
     if options.seeds != flag_table.DEFAULT_SEEDS:
         changed["seeds"] = options.seeds
     return run_config.default_name(changed, datetime.now(UTC))
