@@ -1,8 +1,11 @@
-"""The paper's experiments, one run after another: `python -m experiments.sweep --grid=table2 --steps=1000000`.
+"""Trains a grid of runs: `python -m experiments.sweep --grid=table2 --steps=1000000`.
 
 A cell of a grid is one run of `experiments.run`: an algorithm on a task, with all seeds. Flags other than those below
 go to every run, for example --steps=1000000, --physics=mujoco or --preset=released. Finished runs are skipped and
 interrupted ones resumed, so the same command can be repeated. Runs of the same flags are shared by all grids.
+
+--launcher says where the runs are started: in processes here or on a cluster. A run that fails does not stop the
+others. The exit code is the worst of the runs': 130 interrupted, 1 failed, 2 bad usage, 3 a member diverged, 0 done.
 """
 
 import sys
@@ -11,10 +14,13 @@ from pathlib import Path
 
 from absl import app, flags
 
-from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, reject_folder
+from experiments.commandline.arguments import BAD_USAGE, DONE, UsageError, printable, reject_folder
 from experiments.commandline.path_flags import define_path
-from experiments.grids.grid import GRIDS, make_cells
-from experiments.grids.train_cells import train_cells, train_in_process
+from experiments.grids import status
+from experiments.grids.grid import GRIDS, OWN_GRID, make_cells, needs_training
+from experiments.grids.stopping import collected_signals
+from experiments.grids.train_cells import repeat_command, train_cells
+from experiments.launchers.choice import LAUNCHERS, LauncherOptions, make_launcher
 
 FLAGS = flags.FLAGS
 
@@ -22,9 +28,25 @@ FLAGS = flags.FLAGS
 def main(argv: Sequence[str]) -> int:
     """Trains the grid; `argv` has the program name and the flags for every run. Returns the exit code."""
     try:
-        reject_folder("--out", Path(FLAGS.out))
-        cells = make_cells(FLAGS.grid, FLAGS.algos, FLAGS.tasks, Path(FLAGS.out), argv[1:])
-        return train_cells(cells, train_in_process, lambda line: print(line, flush=True))
+        out = Path(FLAGS.out)
+        cells = make_cells(FLAGS.grid, FLAGS.algos, FLAGS.tasks, out, argv[1:], _seeds_per_cell(FLAGS.split))
+        if FLAGS.status:
+            _say(*status.status_lines(cells))
+            return DONE
+        if FLAGS.dry_run:
+            _say(*(repeat_command(cell) for cell in cells if needs_training(cell)))
+            return DONE
+        reject_folder("--out", out)
+        launcher = make_launcher(LauncherOptions(launcher=FLAGS.launcher, workers=FLAGS.workers, out=out))
+        with collected_signals() as received:
+            return train_cells(
+                cells,
+                launcher,
+                _say,
+                retries=FLAGS.retries,
+                fail_fast=FLAGS.fail_fast,
+                signals=lambda: len(received),
+            )
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
@@ -33,10 +55,32 @@ def main(argv: Sequence[str]) -> int:
         return BAD_USAGE
 
 
+def _say(*lines: str) -> None:
+    for line in lines:
+        print(printable(line), flush=True)
+
+
+def _seeds_per_cell(text: str | None) -> int | None:
+    """K of `--split=seeds:K`."""
+    if text is None:
+        return None
+    name, _, count = text.partition(":")
+    if name != "seeds" or not (count.isascii() and count.isdecimal() and int(count[:9]) > 0):
+        raise UsageError(f"--split={text}: expects seeds:K, the seeds of each run in cells of K")
+    return int(count[:9])
+
+
 if __name__ == "__main__":
-    flags.DEFINE_string("grid", None, f"What to train: {', '.join(GRIDS)}.")
+    flags.DEFINE_string("grid", None, f"What to train: {', '.join(GRIDS)}, or {OWN_GRID}.")
     flags.DEFINE_list("algos", [], "Algorithms, if not the grid's.")
     flags.DEFINE_list("tasks", [], "Tasks, if not the grid's.")
-    define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/.")
+    flags.DEFINE_string("split", None, "seeds:K: each run's seeds in cells of K, which tables pool as one row.")
+    define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/. On a cluster: a folder that all machines share.")
+    flags.DEFINE_string("launcher", "local", f"Where runs are started: {', '.join(LAUNCHERS)}.")
+    flags.DEFINE_integer("workers", None, "With local: runs side by side, each on GPUs or cores of its own.", 1)
+    flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
+    flags.DEFINE_bool("fail_fast", False, "Stop at the first run that fails.")
+    flags.DEFINE_bool("status", False, "Print the state of the grid's runs and train nothing.")
+    flags.DEFINE_bool("dry_run", False, "Print a command per run that is not finished, and train nothing.")
     # known_only: unknown flags stay in argv.
     app.run(main, flags_parser=lambda argv: FLAGS(argv, known_only=True))

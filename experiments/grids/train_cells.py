@@ -1,98 +1,99 @@
-"""Trains the cells of a grid one after another, each in a process of its own."""
+"""Trains the cells of a grid through a launcher, retries lost ones, and lists those that failed."""
 
-import signal
-import subprocess
-import sys
+import shlex
 import time
 from collections.abc import Callable, Sequence
-from types import FrameType
-from typing import Any
 
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED
-from experiments.grids.grid import GridCell, finished, needs_training
+from experiments.grids.grid import finished, needs_training
+from experiments.grids.status import progress_text, scores
+from experiments.launchers.cell import Cell, Ended
+from experiments.launchers.launcher import Launcher
 from experiments.running.progress import format_seconds
-from experiments.running.signals import announcements
 
-
-def train_in_process(cell: GridCell) -> int:
-    """Trains a cell by `experiments.run` and returns its exit code.
-
-    Its output goes to a file NAME.log.txt next to the run's folder; errors are also printed. SIGINT, SIGTERM and the
-    signals that announce an end reach the run, which then saves a checkpoint.
-    """
-    cell.path.parent.mkdir(parents=True, exist_ok=True)
-    with (cell.path.parent / f"{cell.path.name[:100]}.log.txt").open("a") as log:
-        command = [sys.executable, "-m", "experiments.run", *cell.command]
-        process: subprocess.Popen[str] | None = None
-        stopped = False
-
-        def forward(number: int, _: FrameType | None) -> None:
-            nonlocal stopped
-            stopped = True
-            if process:
-                process.send_signal(number)
-
-        before = {number: signal.signal(number, forward) for number in (signal.SIGTERM, *announcements())}
-        try:
-            process = subprocess.Popen(command, stdout=log, stderr=subprocess.PIPE, text=True, errors="replace")
-            if stopped:  # before the process existed
-                process.terminate()
-            while True:
-                try:
-                    _, errors = process.communicate()
-                    break
-                except KeyboardInterrupt:  # Ctrl-C reaches the run too
-                    stopped = True
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-    code = process.returncode
-    if stopped and code not in (FAILED, BAD_USAGE):  # also if the run had just ended or just started
-        return INTERRUPTED
-    if code not in (DONE, DIVERGED, INTERRUPTED) and errors.strip():
-        print(errors.strip(), file=sys.stderr)
-    return code
+WORST_FIRST = (INTERRUPTED, FAILED, BAD_USAGE, DIVERGED, DONE)
+PROGRESS_SECONDS = 120.0
 
 
 def train_cells(
-    cells: Sequence[GridCell],
-    train: Callable[[GridCell], int],
+    cells: Sequence[Cell],
+    launcher: Launcher,
     say: Callable[[str], None],
+    *,
+    retries: int = 0,
+    fail_fast: bool = False,
+    signals: Callable[[], int] = lambda: 0,
     clock: Callable[[], float] = time.monotonic,
 ) -> int:
-    """Trains the cells that are not finished, up to the first one that fails or is interrupted.
+    """Trains the cells that are not finished. One that fails does not stop the others.
 
     Args:
-      train: trains a cell and returns the exit code of its run.
+      launcher: starts them.
       say: called with each line to print.
+      retries: how often a cell is started again that was killed or whose machine was lost.
+      fail_fast: the first cell that fails stops all others, after they have saved.
+      signals: how many signals have asked to stop: the first lets runs save, a second ends them at once.
 
     Returns:
-      That cell's exit code; else `DIVERGED` if a member diverged; else `DONE`.
+      The worst exit code of the cells, the first of `WORST_FIRST`.
     """
     todo = [cell for cell in cells if needs_training(cell)]
     say(f"{len(cells)} runs, {len(cells) - len(todo)} of them finished")
-    began, worst = clock(), DONE
-    for number, cell in enumerate(todo, start=1):
-        started = clock()
-        code = train(cell)
-        if code not in (DONE, DIVERGED):
-            hint = "" if code == BAD_USAGE else "; the same command resumes it"
-            say(f"{cell.algo} on {cell.task}: ended with exit code {code}{hint}")
-            return code
-        worst = max(worst, code)
-        left = (clock() - began) / number * (len(todo) - number)
-        say(
-            f"{number}/{len(todo)} {cell.algo} on {cell.task}: {_scores(finished(cell))} in "
-            f"{format_seconds(clock() - started)}; {format_seconds(left)} left"
-        )
-    return worst
+    began, told = clock(), clock()
+    over: list[Ended] = []
+    starts = dict.fromkeys(todo, 1)
+    cancelled = 0
+    with launcher:
+        launcher.submit(todo)
+        while len(over) < len(todo):
+            failed = fail_fast and any(ended.code not in (DONE, DIVERGED) for ended in over)
+            for _ in range(min(max(signals(), failed), 2) - cancelled):
+                launcher.cancel()
+                cancelled += 1
+            for ended in launcher.ended():
+                cell = ended.cell
+                if cancelled and ended.lost:  # also one that was asked to end before it could save
+                    ended = ended._replace(code=INTERRUPTED)
+                elif ended.lost and starts[cell] <= retries:
+                    say(f"{cell.label}: {ended.reason}; started again ({starts[cell]} of {retries})")
+                    starts[cell] += 1
+                    launcher.submit([cell])
+                    continue
+                over.append(ended)
+                left = (clock() - began) / len(over) * (len(todo) - len(over))
+                say(f"{len(over)}/{len(todo)} {cell.label}: {_result(ended)}; {format_seconds(left)} left")
+            if clock() - told > PROGRESS_SECONDS:
+                told = clock()
+                ended_cells = {ended.cell for ended in over}
+                for line in filter(None, (progress_text(cell) for cell in todo if cell not in ended_cells)):
+                    say(line)
+    for line in _failures(over):
+        say(line)
+    return min((_exit_code(ended) for ended in over), key=WORST_FIRST.index, default=DONE)
 
 
-def _scores(summary: dict[str, Any] | None) -> str:
-    """The scores in a run's summary.json, as text."""
-    if summary is None:
-        return "no summary"
-    scores = [group["score"] for group in summary["groups"]]
-    parts = ["none" if s["mean"] is None else f"{s['mean']:,.0f} +- {s['std']:,.0f}" for s in scores]
-    lost = len(summary["diverged"])
-    return f"score {', '.join(parts)}" + (f" ({lost} diverged)" if lost else "")
+def repeat_command(cell: Cell) -> str:
+    """The command line that trains a cell, or resumes it."""
+    return shlex.join(["python", "-m", "experiments.run", *cell.command])
+
+
+def _result(ended: Ended) -> str:
+    if ended.code in (DONE, DIVERGED):
+        return scores(finished(ended.cell))
+    return ended.reason
+
+
+def _failures(over: Sequence[Ended]) -> list[str]:
+    """What did not end well: cell, reason, log and the command that repeats it."""
+    failed = [ended for ended in over if ended.code not in (DONE, DIVERGED)]
+    if not failed:
+        return []
+    lines = [f"{len(failed)} of {len(over)} runs did not finish:"]
+    for ended in failed:
+        lines += [f"  {ended.cell.label}: {ended.reason}", f"    log: {ended.cell.log}"]
+        lines += [f"    repeat: {repeat_command(ended.cell)}"]
+    return lines
+
+
+def _exit_code(ended: Ended) -> int:
+    return ended.code if ended.code in WORST_FIRST else FAILED

@@ -1,0 +1,89 @@
+"""The state of a grid's runs, read from their files: from any machine that shares the folder."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from experiments.commandline.arguments import DIVERGED, DONE
+from experiments.grids.grid import finished
+from experiments.launchers.cell import Cell, read_ended
+from experiments.running import records, run_config
+from experiments.running.progress import format_seconds
+
+
+class State(NamedTuple):
+    """A run's state."""
+
+    word: str  # done, running, failed, interrupted or waiting
+    text: str  # what else there is to say
+
+
+class Progress(NamedTuple):
+    """How far a run is, by its last evaluation."""
+
+    env_steps: int
+    steps: int  # at its end
+    seconds: float  # since its start, without the time between processes
+
+    @property
+    def seconds_left(self) -> float | None:
+        """At the run's mean speed so far; None before the second evaluation."""
+        return self.seconds / self.env_steps * (self.steps - self.env_steps) if self.env_steps else None
+
+
+def read_progress(cell: Cell) -> Progress | None:
+    """How far the cell's run is; None without a table."""
+    try:
+        table = records.read_evaluations(cell.path / "evaluations.csv")
+        steps = run_config.read(cell.path).members[0].config.train.steps
+        return Progress(int(table["env_steps"][-1]), steps, float(table["wall_seconds"][-1]))
+    except (OSError, ValueError, KeyError, IndexError):
+        return None
+
+
+def state_of(cell: Cell) -> State:
+    """The state of a cell's run."""
+    if summary := finished(cell):
+        return State("done", scores(summary))
+    ended = read_ended(cell)
+    if ended is None:
+        begun = (cell.path / run_config.NAME).exists()
+        return State("interrupted" if begun else "waiting", _progress(cell) if begun else "")
+    if ended.code in (DONE, DIVERGED):
+        return State("waiting", "")  # its folder was removed since
+    if ended.lost or ended.reason.startswith("interrupted"):
+        return State("interrupted", f"{_progress(cell)} ({ended.reason})")
+    return State("failed", f"{ended.reason}; log: {cell.log}")
+
+
+def status_lines(cells: Sequence[Cell]) -> list[str]:
+    """A line per cell, and one that counts the states."""
+    states = [state_of(cell) for cell in cells]
+    width = max((len(cell.label) for cell in cells), default=0)
+    lines = [f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip() for cell, state in zip(cells, states)]
+    counts = {word: sum(state.word == word for state in states) for word in dict.fromkeys(s.word for s in states)}
+    return [*lines, f"{len(cells)} runs: " + ", ".join(f"{count} {word}" for word, count in counts.items())]
+
+
+def progress_text(cell: Cell) -> str | None:
+    """A line about a run that is being trained; None if it is not."""
+    state = state_of(cell)
+    return f"{cell.label}: {state.text}" if state.word == "running" else None
+
+
+def scores(summary: dict[str, Any] | None) -> str:
+    """The scores in a run's summary.json, as text."""
+    if summary is None:
+        return "no summary"
+    found = [group["score"] for group in summary["groups"]]
+    parts = ["none" if s["mean"] is None else f"{s['mean']:,.0f} +- {s['std']:,.0f}" for s in found]
+    lost = len(summary["diverged"])
+    return f"score {', '.join(parts)}" + (f" ({lost} diverged)" if lost else "")
+
+
+def _progress(cell: Cell) -> str:
+    progress = read_progress(cell)
+    if progress is None:
+        return "before its first evaluation"
+    left = progress.seconds_left
+    text = f"step {progress.env_steps:,} of {progress.steps:,}"
+    return text if left is None else f"{text}, {format_seconds(left)} left"
