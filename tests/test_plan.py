@@ -160,6 +160,7 @@ def test_a_folder_needs_no_other_flags(tmp_path):
 
 
 DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
+DEFAULTS |= {"tuned": ""}
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,11 @@ class OutputConfig:
         high=1000,
     )
     tensorboard: bool = setting(True, "also write TensorBoard events")
+    tuned: str = setting(
+        "",
+        "how the settings were tuned, for a footnote in tables: experiments.tune sets it",
+        default_text="they were not",
+    )
 
 
 class Flag(NamedTuple):

@@ -50,6 +50,7 @@ class Options(NamedTuple):
     devices: int | None
     env_processes: int | None
     tensorboard: bool | None
+    tuned: str | None
     quiet: bool
 
     @property

@@ -6,20 +6,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import psutil
 
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.presets import preset_settings
-from experiments.running import records, resume, run_config
+from experiments.running import memory, records, resume, run_config
 from experiments.running.run_config import Member, RunConfig
 from experiments.surroundings import jax_settings
 from sqt_jax import envs
 from sqt_jax.config import ENVIRONMENT, Config, TrainConfig
 from sqt_jax.envs import gym_ids
 from sqt_jax.envs.factories import is_factory
-from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate, named_env
-from sqt_jax.job_limits import memory_limits
+from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, named_env
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Environment
@@ -85,20 +83,15 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
             raise not_only_a_run(target.path) from None
         except OSError as error:
             raise UsageError(f"--out={options.out}: expects a folder that can be read: {error}") from None
-    config, count = target.members[0].config, len(target.members)
+    config = target.members[0].config
     output = _output(options, target.resumed, config.train)
     used_env = env or _named_env(config, output["env_processes"])
     if used_env.host is None and options.env_processes:
         raise UsageError(f"--env_processes: has no effect with {config.env}; expects an environment of Gymnasium's")
     if used_env.host:
         output["devices"] = _one_device(options.devices)
-    layout = _layout(count, output["devices"], typed=options.devices is not None)
-    needed, (free, where) = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
-    if needed > free:
-        raise UsageError(
-            f"--replay_capacity={config.train.replay_capacity}: {count} members need about "
-            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free {where}; expects a smaller number, or fewer --seeds"
-        )
+    layout = _layout(len(target.members), output["devices"], typed=options.devices is not None)
+    memory.check(config, layout, used_env)
     return Plan(
         members=target.members,
         swept=target.swept,
@@ -281,12 +274,3 @@ def name_taken(path: Path) -> UsageError:
     return UsageError(
         f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
     )
-
-
-def _free_memory(devices: int) -> tuple[int, str]:
-    """Bytes available to a run, and what limits them: the accelerators, the machine or a limit of the job."""
-    stats = jax.local_devices()[0].memory_stats()
-    if stats and "bytes_limit" in stats:
-        return devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0)), "on the devices"
-    found = [(limit.left, f"under {limit.name}") for limit in memory_limits()]
-    return min([(psutil.virtual_memory().available, "here"), *found])
