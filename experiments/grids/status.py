@@ -59,7 +59,10 @@ def status_lines(cells: Sequence[Cell]) -> list[str]:
     """A line per cell, and one that counts the states."""
     states = [state_of(cell) for cell in cells]
     width = max((len(cell.label) for cell in cells), default=0)
-    lines = [f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip() for cell, state in zip(cells, states)]
+    lines = [
+        f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip()
+        for cell, state in zip(cells, states, strict=True)
+    ]
     counts = {word: sum(state.word == word for state in states) for word in dict.fromkeys(s.word for s in states)}
     return [*lines, f"{len(cells)} runs: " + ", ".join(f"{count} {word}" for word, count in counts.items())]
 
