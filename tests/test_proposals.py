@@ -1,12 +1,13 @@
 """Proposals are a function of the trials before them; TPE finds the best of a made-up objective."""
 
 import numpy as np
-import optuna
 import pytest
-from optuna.trial import TrialState, create_trial
 
-from experiments.tuning.proposals import distributions, make_sampler, propose
-from experiments.tuning.space import parse_space
+optuna = pytest.importorskip("optuna", reason="needs the extra tune")
+from optuna.trial import TrialState, create_trial  # noqa: E402
+
+from experiments.tuning.proposals import distributions, make_sampler, propose  # noqa: E402
+from experiments.tuning.space import parse_space  # noqa: E402
 
 AXES = parse_space("penalty_coef=0..1,lr=log:1e-4..1e-3,tau=0.01|0.02,gamma=0.9..1:0.02", "td3_sqt")
 

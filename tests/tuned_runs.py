@@ -3,18 +3,37 @@
 import json
 
 import numpy as np
+import pytest
 from made_runs import write_run
 
-from experiments.commandline.arguments import DIVERGED, DONE
-from experiments.launchers.cell import Ended
-from experiments.tuning.batches import Task
-from experiments.tuning.space import parse_space
-from experiments.tuning.study import Study, open_study
-from experiments.tuning.tuner import Pace, Plan, run_study
+pytest.importorskip("optuna", reason="needs the extra tune")
+
+from experiments.commandline.arguments import DIVERGED, DONE  # noqa: E402
+from experiments.launchers.cell import Ended  # noqa: E402
+from experiments.tuning.batches import Task  # noqa: E402
+from experiments.tuning.space import parse_space  # noqa: E402
+from experiments.tuning.study import Study, open_study  # noqa: E402
+from experiments.tuning.tune_flags import Given  # noqa: E402
+from experiments.tuning.tuner import Pace, Plan, run_study  # noqa: E402
 
 SPACE = "penalty_coef=0..1"
 TASK = Task("td3_sqt", "cheetah", "cheetah", ())
 SEEDS = (0, 1)
+
+
+GIVEN = Given(
+    algo="td3_sqt",
+    env="half_cheetah",
+    space="penalty_coef=0..1,lr=log:1e-4..1e-3",
+    trials=64,
+    batch=16,
+    seeds=["0", "1"],
+    sampler="tpe",
+    sampler_seed=0,
+    objective="score",
+    final_seeds=10,
+    out="runs/tuned",
+)
 
 
 def value(coef, seed):
