@@ -1,5 +1,4 @@
-"""Tunes swept settings of an algorithm on a task: `python -m experiments.tune --algo=td3_sqt --env=cheetah
---space=penalty_coef=0..1 --trials=64 --batch=16 --seeds=0,1 --steps=20000 --out=runs/tuned/cheetah`.
+"""Tunes settings: `python -m experiments.tune --algo=td3_sqt --env=cheetah --space=penalty_coef=0..1 --steps=20000`.
 
 Optuna proposes trials. One run of experiments.run trains a batch of them, each with all seeds, in one program. The best
 trial is then trained again on seeds that tuning never saw, beside its baseline, tuned over the same space with as many
