@@ -1,5 +1,6 @@
 """The command on a real task: killed by -9 it ends as the uninterrupted study, and a batch is one compilation."""
 
+import json
 import os
 import re
 import signal
@@ -46,7 +47,7 @@ def test_a_study_that_is_killed_ends_as_the_uninterrupted_one(tmp_path):
     assert whole.wait(1200) == 0, whole.communicate()[0]
     out = tmp_path / "killed"
     batch = out / "trials" / "cheetah" / "td3_sqt"
-    for moment in ("batch_0001/checkpoint/100", "batch_0002/config.json"):
+    for moment in ("batch_0001/checkpoint/step_0000000100", "batch_0002/config.json"):
         process = start(out, *space)
         wait_for(batch / moment, process)
         process.send_signal(signal.SIGKILL)
@@ -54,6 +55,7 @@ def test_a_study_that_is_killed_ends_as_the_uninterrupted_one(tmp_path):
         time.sleep(1)  # the run dies with it
     last = start(out, *space)
     assert last.wait(1200) == 0, last.communicate()[0]
+    assert json.loads((batch / "batch_0001" / "config.json").read_text())["resumed"]  # it was killed while it trained
     assert trials(out) == trials(tmp_path / "whole") and len(trials(out)) == 4
     without_command = [re.sub(r"--out=\S+", "", (tmp_path / n / "tuning.csv").read_text()) for n in ("killed", "whole")]
     assert without_command[0] == without_command[1]
