@@ -13,13 +13,14 @@ or in all trials, 130 interrupted.
 import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from absl import app, flags
 
 from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, reject_folder
 from experiments.commandline.path_flags import define_path
 from experiments.launchers.choice import LAUNCHERS, LauncherOptions, make_launcher
+from experiments.launchers.launcher import Launcher
 from experiments.tuning.tune_flags import OBJECTIVES, SAMPLERS, Given, Options, check_flags
 
 FLAGS = flags.FLAGS
@@ -43,10 +44,10 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
         reject_folder("--out", options.out)
-        local = FLAGS.launcher == "local"
-        launcher = LauncherOptions(launcher=FLAGS.launcher, workers=FLAGS.workers if local else None, out=options.out)
-        make_launcher(launcher)  # its flags are checked now
-        return _tune(options, launcher, FLAGS.workers if local else 0)
+        here = FLAGS.launcher == "local"
+        launcher = LauncherOptions(launcher=FLAGS.launcher, workers=FLAGS.workers if here else None, out=options.out)
+        first = [make_launcher(launcher)]  # now, so that its flags are checked
+        return tune(options, lambda: first.pop() if first else make_launcher(launcher), FLAGS.workers if here else 0)
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
@@ -55,12 +56,12 @@ def main(argv: Sequence[str]) -> int:
         return BAD_USAGE
 
 
-def _tune(options: Options, launcher: LauncherOptions, workers_here: int) -> int:
+def tune(options: Options, launcher: Callable[[], Launcher], workers_here: int) -> int:
+    """Tunes; returns the exit code. Arguments as of `Session` and its `run`."""
     from experiments.tuning.session import Session  # imports Optuna and matplotlib
 
     command = shlex.join(["python", "-m", "experiments.tune", *sys.argv[1:]])
-    session = Session(options, lambda: make_launcher(launcher), FLAGS.workers, FLAGS.retries, command)
-    return session.run(workers_here)
+    return Session(options, launcher, FLAGS.workers, FLAGS.retries, command).run(workers_here)
 
 
 if __name__ == "__main__":
@@ -72,7 +73,7 @@ if __name__ == "__main__":
         "What is tuned: NAME=LOW..HIGH, NAME=log:LOW..HIGH, NAME=LOW..HIGH:STEP or 'NAME=A|B|C', separated by commas.",
     )
     flags.DEFINE_integer("trials", 64, "Trials, of the algorithm and of its baseline.", 1)
-    flags.DEFINE_integer("batch", 16, "Trials that are asked for and trained together.", 1)
+    flags.DEFINE_integer("batch", 16, "Trials that are asked for and trained together.", 1, 5000)
     flags.DEFINE_list("seeds", ["0", "1"], "Seeds of each trial.")
     flags.DEFINE_string("sampler", "tpe", f"Who proposes: {', '.join(SAMPLERS)}.")
     flags.DEFINE_integer("sampler_seed", 0, "Seed of the proposals.", 0)

@@ -133,7 +133,7 @@ def test_tables_mark_what_was_tuned_and_leave_its_trials_out(tuned):
     runs = collect([str(out)])
     assert {group.seeds for group in runs.groups} == {FRESH}  # none of the twelve trials
     assert [note for note in runs.notes if "trials of a tuning" in note] == [
-        f"left out: {out}/trials has the trials of a tuning; RUNS={out}/trials shows them"
+        f"left out: {out}/trials, the trials of a tuning; given as one of RUNS it is shown"
     ]
     note = "settings tuned on other seeds: 12 trials x 2 seeds"
     table = table_2(runs, False)

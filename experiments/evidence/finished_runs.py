@@ -54,7 +54,7 @@ def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
         for run in below:
             found.setdefault(run.resolve(), run)
         notes += [f"left out: {folder} has an evaluations.csv but no config.json" for folder in without]
-        notes += [f"left out: {folder} has the trials of a tuning; RUNS={folder} shows them" for folder in tuning]
+        notes += [f"left out: {folder}, the trials of a tuning; given as one of RUNS it is shown" for folder in tuning]
     return list(found.values()), notes
 
 

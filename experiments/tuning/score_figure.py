@@ -78,5 +78,7 @@ def _draw_panel(axes: Axes, one: Tuned, axis: Axis, setup: Setup) -> None:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
+    margin = 1.08 if axis.log else 0.03 * (axis.high - axis.low)
+    axes.set_xlim((axis.low / margin, axis.high * margin) if axis.log else (axis.low - margin, axis.high + margin))
     axes.set_xlabel(f"{axis.name} of {one.winner.task.algo}", fontsize="small")
     style_axes(axes, steps=False)

@@ -120,7 +120,8 @@ class Session:
         todo = [cells[w.task.algo] for w in winners if w.is_trained and not finished(cells[w.task.algo])]
         if self.received:
             return INTERRUPTED
-        _say(f"fresh seeds {self.fresh[0]} to {self.fresh[-1]}: {len(todo)} runs{pace.left}")
+        if todo:
+            _say(f"fresh seeds {self.fresh[0]} to {self.fresh[-1]}: {len(todo)} runs{pace.left}")
         code = self._train(todo, lambda ended: pace.passed(len(self.fresh)))
         if code not in (DONE, DIVERGED):
             return code
