@@ -7,7 +7,7 @@ from tuned_runs import GIVEN, write_cell
 
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED, UsageError
 from experiments.launchers.cell import Ended
-from experiments.running import files
+from experiments.running import folder_lock
 from experiments.tuning import session
 from experiments.tuning.session import Session
 from experiments.tuning.tune_flags import check_flags
@@ -103,8 +103,8 @@ def test_other_settings_need_another_folder(tune):
 
 def test_one_process_tunes_in_a_folder(tune, tmp_path):
     with (
-        files.locked(tmp_path / "out"),
-        pytest.raises(UsageError, match="^--out=.*: process .* is tuning there; expec"),
+        folder_lock.locked(tmp_path / "out"),
+        pytest.raises(UsageError, match="^--out=.*: host .*, process .* is tuning there; "),
     ):
         tune()
 

@@ -18,7 +18,7 @@ from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import train_cells
 from experiments.launchers.cell import Cell, Ended
 from experiments.launchers.launcher import Launcher
-from experiments.running import files
+from experiments.running import folder_lock
 from experiments.tuning import report, score_figure
 from experiments.tuning.batches import Task
 from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds
@@ -69,12 +69,10 @@ class Session:
             if self.received:
                 return INTERRUPTED
             try:
-                with files.locked(self.options.out, _say):
+                with folder_lock.locked(self.options.out, _say):
                     return self._tune(env, folder)
-            except files.Busy as busy:
-                raise UsageError(
-                    f"--out={self.options.out}: process {busy.process} is tuning there; expects another folder"
-                ) from None
+            except folder_lock.Busy as busy:
+                raise UsageError(f"--out={self.options.out}: {busy} is tuning there; expects another folder") from None
 
     def _check(self, workers_here: int) -> tuple[str, str]:
         """The name and the folder of the environment, after a check of all runs (`check_runs`)."""
