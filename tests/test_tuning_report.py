@@ -156,4 +156,9 @@ def test_a_baseline_that_is_tuned_too_is_said_to_be(tmp_path):
     study, _ = run(tmp_path, trials=4)
     winner = Winner(Task("td3", "cheetah", "cheetah", ()), study, study.best)
     caption = make_table([Tuned(winner, None), Tuned(winner, None)], SETUP).caption
-    assert "td3, the baseline, was tuned over the settings of the space that it has, with as many trials" in caption
+    assert "td3, the baseline, was tuned over the settings of the space that it has" in caption
+    assert caption.endswith(" with as many trials.")
+    more, _ = run(tmp_path / "more", trials=8)
+    first = Winner(TASK, more, more.best)
+    caption = make_table([Tuned(first, None), Tuned(winner, None)], SETUP).caption
+    assert caption.endswith(" with its whole grid.")

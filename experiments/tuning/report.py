@@ -197,13 +197,15 @@ def _caption(tuned: Sequence[Tuned], setup: Setup) -> str:
     )
     if len(tuned) > 1:
         text += " Last row: the mean of the differences seed by seed; its interval resamples both of a seed together."
-        base = tuned[1].winner
-        text += (
-            f" {base.task.algo}, the baseline, has nothing to tune in this space."
-            if base.study is None
-            else f" {base.task.algo}, the baseline, was tuned over the settings of the space that it has, with as many "
-            "trials and seeds."
-        )
+        base, own = tuned[1].winner, tuned[0].winner.study
+        if base.study is None:
+            text += f" {base.task.algo}, the baseline, has nothing to tune in this space."
+        else:
+            fewer = own and len(base.study.trials) < len(own.trials)
+            text += (
+                f" {base.task.algo}, the baseline, was tuned over the settings of the space that it has, on the same "
+                f"seeds, with {'its whole grid' if fewer else 'as many trials'}."
+            )
     return text
 
 
