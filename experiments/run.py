@@ -56,9 +56,12 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
             jax_settings.prepare()
             env = env or own_environment(options)
             # Imports SciPy, TensorBoard and Orbax: a typing error is reported without waiting for them.
+            from experiments.running.plan import make_plan
             from experiments.running.session import start_session
 
-            return start_session(options, env, argv).run()
+            plan = make_plan(options, env)
+            with jax_settings.needed_switches():  # again: the environment's module may have changed them
+                return start_session(plan, argv).run()
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise

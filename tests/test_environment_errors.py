@@ -26,6 +26,6 @@ def test_steps_that_are_not_finite_are_counted_over_members_and_environments():
         state = timestep.state._replace(unstable=np.array(steps), unstable_starts=np.array(starts))
         return environment_errors.unstable_steps(env, timestep._replace(state=state))
 
-    expected = "1 steps and 7 starts of counter had an observation or a reward that is not finite"
+    expected = "1 steps and 7 starts of counter had an observation, reward or action that is not finite"
     assert line([[0, 1], [0, 0]], [[3, 0], [4, 0]]).startswith(expected)
     assert line([[0, 0]], [[0, 0]]) == ""

@@ -90,13 +90,14 @@ def test_jax_is_found_in_whatever_an_environment_keeps(kept, holds):
     assert gym_ids.uses_jax(env) == holds
 
 
-def test_a_wrapper_that_hides_the_end_of_episodes_does_not_make_them_endless():
+@pytest.mark.parametrize("max_episode_steps", [0, 9])
+def test_a_wrapper_that_hides_the_end_of_episodes_does_not_make_them_endless(max_episode_steps):
     class Hiding(gymnasium.Wrapper):
         def step(self, action):
             obs, reward, terminated, _, info = self.env.step(action)
             return obs, reward, terminated, False, info
 
-    env = from_gymnasium("hiding", lambda: Hiding(TimeLimit(Counter(), 3)))
+    env = from_gymnasium("hiding", lambda: Hiding(TimeLimit(Counter(), 3)), max_episode_steps)
     timestep, truncated = env.reset(jax.random.key(0)), []
     for _ in range(6):
         timestep = env.step(timestep, jnp.zeros(3))

@@ -36,6 +36,6 @@ def unstable_steps(env: Environment, timestep: TimeStep) -> str:
     if not steps + starts:
         return ""
     return (
-        f"{steps:,} steps and {starts:,} starts of {env.name} had an observation or a reward that is not finite, or "
-        "beyond 1e10: such a step ends its episode with reward 0"
+        f"{steps:,} steps and {starts:,} starts of {env.name} had an observation, reward or action that is not finite, "
+        "or beyond 1e10: such a step ends its episode with reward 0"
     )

@@ -18,13 +18,12 @@ from experiments.commandline.arguments import (
     UsageError,
     printable,
 )
-from experiments.commandline.flags import Options
 from experiments.running import environment_errors, files, folder_lock, manifests, records, resume, run_config
 from experiments.running.announce import Announcer
 from experiments.running.checkpoints import CheckpointStore, Restored
 from experiments.running.csv_rows import MissingRows, WrongColumns
 from experiments.running.loop import START, Outcome, Position, train_loop
-from experiments.running.plan import Plan, make_plan, name_taken, not_only_a_run
+from experiments.running.plan import Plan, name_taken, not_only_a_run
 from experiments.running.progress import Display
 from experiments.running.run_config import Member
 from experiments.running.run_policies import RunPolicies
@@ -34,16 +33,15 @@ from sqt_jax.experiment import make_trainer, replay_of
 from sqt_jax.one_line import one_line
 from sqt_jax.policy_folders import BEST, LAST
 from sqt_jax.train import TrainState, make_sweep
-from sqt_jax.types import Array, Environment, HostError, Scalars
+from sqt_jax.types import Array, HostError, Scalars
 
 
-def start_session(options: Options, env: Environment | None, command: Sequence[str]) -> "Session":
-    """The session of a parsed command line. Raises `UsageError` as `make_plan`.
+def start_session(plan: Plan, command: Sequence[str]) -> "Session":
+    """The session of a plan. Raises `UsageError` if the run's folder cannot be made.
 
     A run without a --name gets a folder of its own, also if another process chose the same name at the same time.
     """
-    plan = make_plan(options, env)
-    if options.name is None and plan.resumed is None:
+    if plan.options.name is None and plan.resumed is None:
         try:
             plan = plan._replace(path=files.new_folder(plan.path))
         except OSError as error:

@@ -95,7 +95,7 @@ def from_gymnasium(
         env = make()
         limit = time_limit(env)
         in_jax, version = uses_jax(env), version_of(env)
-        bounded = isinstance(env, TimeLimit)
+        bounded = isinstance(env, TimeLimit) and env._max_episode_steps == limit
         env.close()
     except (Exception, SystemExit) as error:
         raise ValueError(with_place(error, __file__)) from error
