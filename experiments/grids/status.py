@@ -1,6 +1,7 @@
 """The state of a grid's runs, read from their files: from any machine that shares the folder."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import DIVERGED, DONE
@@ -40,10 +41,18 @@ def read_progress(cell: Cell) -> Progress | None:
         return None
 
 
-def state_of(cell: Cell) -> State:
-    """The state of a cell's run."""
+def state_of(cell: Cell, queued: tuple[str, str] | None = None) -> State:
+    """The state of a cell's run.
+
+    Args:
+      queued: `waiting` or `running`, and the job, if a batch system says so.
+    """
     if summary := finished(cell):
         return State("done", scores(summary))
+    if queued:
+        word, job = queued
+        begun = word == "running" or read_progress(cell) is not None
+        return State(word, f"{_progress(cell)}; {job}" if begun else job)
     ended = read_ended(cell)
     if ended is None:
         begun = (cell.path / run_config.NAME).exists()
@@ -55,9 +64,9 @@ def state_of(cell: Cell) -> State:
     return State("failed", f"{ended.reason}; log: {cell.log}")
 
 
-def status_lines(cells: Sequence[Cell]) -> list[str]:
-    """A line per cell, and one that counts the states."""
-    states = [state_of(cell) for cell in cells]
+def status_lines(cells: Sequence[Cell], queued: Mapping[Cell, tuple[str, str]] = MappingProxyType({})) -> list[str]:
+    """A line per cell, and one that counts the states. `queued` as in `state_of`, for the cells that are."""
+    states = [state_of(cell, queued.get(cell)) for cell in cells]
     width = max((len(cell.label) for cell in cells), default=0)
     lines = [f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip() for cell, state in zip(cells, states)]
     counts = {word: sum(state.word == word for state in states) for word in dict.fromkeys(s.word for s in states)}
