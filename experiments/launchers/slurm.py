@@ -127,14 +127,17 @@ class SlurmLauncher:
         ours = {submitted.job for submitted in self._jobs.values()} & set(queue)
         waiting = sorted(job for job in ours if queue[job].state == "PENDING")
         running = sorted(job for job in ours if queue[job].state == "RUNNING")
-        with suppress(slurm_queue.CommandError):
-            slurm_queue.cancel(waiting)
+        if waiting:
+            with suppress(slurm_queue.CommandError):
+                slurm_queue.cancel(waiting)
         for job in running:
             with suppress(slurm_queue.CommandError):
                 slurm_queue.send(STOP_SIGNAL, [job])
 
     def _kill(self) -> None:
         ids = [submitted.job for submitted in self._jobs.values()]
+        if not ids:
+            return
         for end in (slurm_queue.kill, slurm_queue.cancel):
             with suppress(slurm_queue.CommandError):
                 end(ids)

@@ -64,6 +64,7 @@ class CellJob(NamedTuple):
             ended = process.wait(POLL_SECONDS)
             while ended is None and told < len(received):
                 number, told = received[told], told + 1
+                print(f"{signal.Signals(number).name} received", file=sys.stderr, flush=True)
                 if number in (*STOP, *SAVE):
                     # The run may have got the signal from SLURM too, or not: that depends on the cluster. As SIGUSR1
                     # it counts once.
@@ -116,6 +117,7 @@ class ThisJob(NamedTuple):
                 if not self._is_running():
                     return False
                 slurm_queue.requeue(self.id)
+                print("requeued", file=sys.stderr, flush=True)
                 return True
             except slurm_queue.CommandError:
                 if time.monotonic() > give_up:

@@ -70,9 +70,13 @@ def rename(job: str, name: str) -> None:
 
 
 def send(signal_name: str, ids: Sequence[str]) -> None:
-    """Sends a signal to the programs of running jobs. Raises `CommandError`, also if a job has just ended."""
+    """Sends a signal to the first step of running jobs. Raises `CommandError`, also if one has no step (any more).
+
+    To the step, not to the job: for an element of an array of which others still wait, SLURM 22.05 delivers the signal,
+    answers that it has not, and scancel repeats it for more than a minute.
+    """
     for begin in range(0, len(ids), CHUNK):
-        _call("scancel", f"--signal={signal_name}", *ids[begin : begin + CHUNK])
+        _call("scancel", f"--signal={signal_name}", *(f"{job}.0" for job in ids[begin : begin + CHUNK]))
 
 
 def cancel(ids: Sequence[str]) -> None:

@@ -27,17 +27,19 @@ def stop_on_signal() -> Iterator[list[int]]:
     """Collects the signals in the list that it yields; a second SIGINT or SIGTERM ends the process at once.
 
     A SIGTERM within a second of another one counts as the same: with a batch system, both the system and
-    `experiments.sweep`, which forwards its own, send one to this process. An announcement that is ignored
+    `experiments.sweep`, which forwards its own, send one to this process. In a job that a launcher started on a
+    cluster (the variable SQT_JOB), all SIGTERMs do: SLURM's scancel may repeat one. An announcement that is ignored
     stays so (`nohup`).
     """
     received: list[int] = []
     last_sigterm = -math.inf
+    same_seconds = math.inf if "SQT_JOB" in os.environ else SAME_SIGNAL_SECONDS
 
     def handle(number: int, _: FrameType | None) -> None:
         nonlocal last_sigterm
         if number == signal.SIGTERM:
             since, last_sigterm = time.monotonic() - last_sigterm, time.monotonic()
-            if since < SAME_SIGNAL_SECONDS:
+            if since < same_seconds:
                 return
         if number in SIGNALS and any(earlier in SIGNALS for earlier in received):
             # Not by an exception: it could be raised inside a callback of the compiled program.
