@@ -10,6 +10,7 @@ one waits for the run's end, whatever the signal:
 | USR1, INT | `experiments.sweep` that was stopped, or a user | saves and ends |
 """
 
+import itertools
 import os
 import platform
 import signal
@@ -20,7 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from experiments.commandline.arguments import BAD_USAGE, INTERRUPTED
+from experiments.commandline.arguments import BAD_USAGE, FAILED, INTERRUPTED
 from experiments.launchers import slurm_queue
 from experiments.launchers.cell import Cell, Ended, write_ended
 from experiments.launchers.cell_process import CellProcess
@@ -29,6 +30,7 @@ STOP = (signal.SIGUSR1, signal.SIGINT)
 SAVE = (signal.SIGUSR2, signal.SIGTERM)
 POLL_SECONDS = 0.5
 REQUEUE_SECONDS = 120.0  # SLURM's controller is asked so long if it does not answer
+MAX_IDLE_REQUEUES = 10  # without a new checkpoint: the job would never end
 NEXT_TRY_SECONDS = 5.0
 INTERRUPTED_TEXT = "interrupted; the same command resumes it"
 
@@ -82,6 +84,10 @@ class CellJob(NamedTuple):
         if received & set(STOP):
             write_ended(Ended(self.cell, INTERRUPTED, INTERRUPTED_TEXT))
             return INTERRUPTED
+        if self._requeues_without_progress(job) >= MAX_IDLE_REQUEUES:
+            reason = f"requeued {MAX_IDLE_REQUEUES} times without a new checkpoint; expects a longer time limit"
+            write_ended(Ended(self.cell, FAILED, reason))
+            return FAILED
         try:
             if job.requeued():
                 return INTERRUPTED
@@ -90,6 +96,17 @@ class CellJob(NamedTuple):
             reason = f"interrupted, and SLURM does not requeue it ({error}); the same command resumes it"
         write_ended(Ended(self.cell, INTERRUPTED, reason, lost=True))
         return INTERRUPTED
+
+    def _requeues_without_progress(self, job: "ThisJob") -> int:
+        """How often in a row the job has come here with the same checkpoints, before this time."""
+        file = self.token.with_name(f"{job.id}.checkpoints")
+        names = (path.name for path in (self.cell.path / "checkpoint").glob("step_*"))
+        newest = max(names, key=lambda name: (len(name), name), default="none")
+        with file.open("a+") as lines:
+            lines.seek(0)
+            before = lines.read().split()
+            lines.write(f"{newest}\n")
+        return len([*itertools.takewhile(lambda name: name == newest, reversed(before))])
 
 
 class ThisJob(NamedTuple):
