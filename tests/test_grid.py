@@ -6,7 +6,7 @@ import pytest
 
 from experiments.commandline import flags
 from experiments.commandline.arguments import UsageError
-from experiments.grids.grid import GRIDS, cells_of, make_cells, run_name
+from experiments.grids.grid import GRIDS, Grid, cells_of, make_cells, parse_variants, run_name, split_seeds
 from sqt_jax.algorithms import ALGORITHMS
 
 
@@ -45,8 +45,71 @@ def test_flags_of_every_run_are_passed_on():
 
 @pytest.mark.parametrize("name", [None, "released"])
 def test_an_unknown_grid_is_rejected(name):
-    with pytest.raises(UsageError, match="^--grid: expects one of table2, table3, table4, all, alpha"):
+    with pytest.raises(
+        UsageError, match="^--grid: expects one of table2, table3, table4, all, alpha, (not .*, )?or settings"
+    ):
         make_cells(name, [], [], Path("runs"), [])
+
+
+def test_a_grid_of_ones_own_is_all_combinations():
+    assert parse_variants("penalty_coef=0.1,0.5; ensemble_size=2,5") == (
+        ("--penalty_coef=0.1", "--ensemble_size=2"),
+        ("--penalty_coef=0.1", "--ensemble_size=5"),
+        ("--penalty_coef=0.5", "--ensemble_size=2"),
+        ("--penalty_coef=0.5", "--ensemble_size=5"),
+    )
+    assert parse_variants("hidden=64,64|256,256") == (("--hidden=64,64",), ("--hidden=256,256",))
+    assert parse_variants("") == ((),)
+    cells = make_cells("penalty_coef=0.1,0.5", ["td3_sqt", "sac_sqt"], ["ant", "walker"], Path("runs"), ["--steps=100"])
+    assert len({cell.path for cell in cells}) == 8
+    assert cells[0].path == Path("runs/ant/td3_sqt/penalty_coef=0.1_steps=100")
+    assert len(make_cells(None, ["td3"], ["ant"], Path("runs"), [])) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("penalty_coef=", "expects settings like"),
+        ("=1", "expects settings like"),
+        ("penalty_coef=1;lr", "expects settings like .*, not 'lr'"),
+        ("penalty_coef=1,1", "expects each value of penalty_coef once"),
+        ("lr=1;lr=2", "expects each setting once"),
+        ("name=a,b", "expects settings of a run, not name"),
+        ("penalty_coeff=1", "^--penalty_coeff: unknown flag; did you mean --penalty_coef"),
+        ("penalty_coef=x", "^--penalty_coef=x: expects a number"),
+    ],
+)
+def test_a_wrong_grid_of_ones_own_is_rejected(text, why):
+    with pytest.raises(UsageError, match=why):
+        make_cells(text, ["td3_sqt"], ["ant"], Path("runs"), [])
+
+
+def test_a_grid_of_too_many_runs_is_rejected():
+    many = ",".join(map(str, range(101)))
+    with pytest.raises(UsageError, match="^--grid: expects at most 10,000 runs, not 10,201"):
+        cells_of(Grid(("td3",), ("ant",), parse_variants(f"warmup_steps={many};eval_every={many}")), (), (), Path(), ())
+
+
+def test_seeds_are_split_over_cells(tmp_path):
+    assert split_seeds(["--seeds=3,1,4,5,9", "--steps=10"], 2) == [
+        ("--steps=10", "--seeds=3,1"),
+        ("--steps=10", "--seeds=4,5"),
+        ("--steps=10", "--seeds=9"),
+    ]
+    assert [flags[-1] for flags in split_seeds([], 3)] == ["--seeds=0,1,2", "--seeds=3,4"]  # the default
+    (tmp_path / "file.yaml").write_text("seeds: [7, 8]")
+    assert split_seeds([f"--config={tmp_path / 'file.yaml'}"], 1)[1][-1] == "--seeds=8"
+    cells = make_cells("alpha", [], [], tmp_path, ["--seeds=0,1"], seeds_per_cell=1)
+    assert [flags.parse(["run", *cell.command]).seeds for cell in cells] == [(0,), (1,)]
+    assert len({cell.path for cell in cells}) == 2
+
+
+def test_the_folder_of_an_own_environment_is_that_of_its_name():
+    def folder(task):
+        (cell,) = make_cells(None, ["td3"], [task], Path("runs"), ["--env_args=scale=2.0"])
+        return cell.path.parent.parent.name
+
+    assert folder("scaled_pendulum:make") == "pendulum"
 
 
 @pytest.mark.parametrize("word", ["--env=ant", "--resume", "ant", "-steps=5"])

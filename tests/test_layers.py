@@ -31,6 +31,7 @@ LAYERS = [
     {"experiments.surroundings.jax_settings"},
     {"experiments.running"},
     {"experiments.evidence"},
+    {"experiments.launchers"},
     {
         "experiments.playing",
         "experiments.benchmarks",
@@ -58,6 +59,7 @@ PACKAGES = (
     "experiments.benchmarks",
     "experiments.gymnasium_parity",
     "experiments.theorem",
+    "experiments.launchers",
     "experiments.grids",
     "experiments.endurance",
 )

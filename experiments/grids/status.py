@@ -1,13 +1,14 @@
 """The state of a grid's runs, read from their files: from any machine that shares the folder."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import DIVERGED, DONE
 from experiments.grids.grid import finished
 from experiments.launchers.cell import Cell, read_ended
-from experiments.running import records, run_config
+from experiments.running import folder_lock, records, run_config
 from experiments.running.progress import format_seconds
 
 
@@ -54,6 +55,10 @@ def state_of(cell: Cell, queued: tuple[str, str] | None = None) -> State:
         begun = word == "running" or read_progress(cell) is not None
         return State(word, f"{_progress(cell)}; {job}" if begun else job)
     ended = read_ended(cell)
+    holder = folder_lock.holder(cell.path)
+    if holder and holder.alive and (ended is None or _is_newer(cell.path / "lock", cell.ended_file)):
+        names = [holder.host, f"process {holder.process}", *([f"job {holder.job}"] if holder.job else [])]
+        return State("running", f"{_progress(cell)} ({', '.join(names)})")
     if ended is None:
         begun = (cell.path / run_config.NAME).exists()
         return State("interrupted" if begun else "waiting", _progress(cell) if begun else "")
@@ -68,7 +73,10 @@ def status_lines(cells: Sequence[Cell], queued: Mapping[Cell, tuple[str, str]] =
     """A line per cell, and one that counts the states. `queued` as in `state_of`, for the cells that are."""
     states = [state_of(cell, queued.get(cell)) for cell in cells]
     width = max((len(cell.label) for cell in cells), default=0)
-    lines = [f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip() for cell, state in zip(cells, states)]
+    lines = [
+        f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip()
+        for cell, state in zip(cells, states, strict=True)
+    ]
     counts = {word: sum(state.word == word for state in states) for word in dict.fromkeys(s.word for s in states)}
     return [*lines, f"{len(cells)} runs: " + ", ".join(f"{count} {word}" for word, count in counts.items())]
 
@@ -87,6 +95,13 @@ def scores(summary: dict[str, Any] | None) -> str:
     parts = ["none" if s["mean"] is None else f"{s['mean']:,.0f} +- {s['std']:,.0f}" for s in found]
     lost = len(summary["diverged"])
     return f"score {', '.join(parts)}" + (f" ({lost} diverged)" if lost else "")
+
+
+def _is_newer(path: Path, other: Path) -> bool:
+    try:
+        return path.stat().st_mtime > other.stat().st_mtime
+    except OSError:
+        return False
 
 
 def _progress(cell: Cell) -> str:

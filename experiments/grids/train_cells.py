@@ -40,7 +40,7 @@ def train_cells(
     """
     todo = [cell for cell in cells if needs_training(cell)]
     say(f"{len(cells)} runs, {len(cells) - len(todo)} of them finished")
-    began, told = clock(), clock()
+    began = said = clock()
     over: list[Ended] = []
     starts = dict.fromkeys(todo, 1)
     cancelled = 0
@@ -53,7 +53,7 @@ def train_cells(
                 cancelled += 1
             for ended in launcher.ended():
                 cell = ended.cell
-                if cancelled and ended.lost:  # also one that was asked to end before it could save
+                if ended.lost and (cancelled or signals()):  # it was asked to end before it could save
                     ended = ended._replace(code=INTERRUPTED)
                 elif ended.lost and starts[cell] <= retries:
                     say(f"{cell.label}: {ended.reason}; started again ({starts[cell]} of {retries})")
@@ -63,10 +63,10 @@ def train_cells(
                 over.append(ended)
                 left = (clock() - began) / len(over) * (len(todo) - len(over))
                 say(f"{len(over)}/{len(todo)} {cell.label}: {_result(ended)}; {format_seconds(left)} left")
-            if clock() - told > PROGRESS_SECONDS:
-                told = clock()
-                ended_cells = {ended.cell for ended in over}
-                for line in filter(None, (progress_text(cell) for cell in todo if cell not in ended_cells)):
+            if clock() - said > PROGRESS_SECONDS:
+                said = clock()
+                not_over = set(todo) - {ended.cell for ended in over}
+                for line in filter(None, (progress_text(cell) for cell in todo if cell in not_over)):
                     say(line)
     for line in _failures(over):
         say(line)

@@ -1,4 +1,4 @@
-"""A cell: one run of `experiments.run` that a launcher starts, and the files beside the run's folder that tell of it."""
+"""A cell: one run of `experiments.run` that a launcher starts, and the files next to the run's folder about it."""
 
 import hashlib
 import json

@@ -19,7 +19,7 @@ from experiments.commandline.arguments import (
     printable,
 )
 from experiments.commandline.flags import Options
-from experiments.running import files, manifests, records, resume, run_config
+from experiments.running import files, folder_lock, manifests, records, resume, run_config
 from experiments.running.announce import Announcer
 from experiments.running.checkpoints import CheckpointStore, Restored
 from experiments.running.csv_rows import MissingRows, WrongColumns
@@ -146,10 +146,10 @@ class Session:
         path, resumed = self.plan.path, self.plan.resumed
         with ExitStack() as stack:
             try:
-                stack.enter_context(files.locked(path, self.display.message))
-            except files.Busy as busy:
+                stack.enter_context(folder_lock.locked(path, self.display.message))
+            except folder_lock.Busy as busy:
                 flag = f"--resume={path}" if resumed else f"--name={path.name}"
-                raise UsageError(f"{flag}: process {busy.process} is training {path}; expects another run") from None
+                raise UsageError(f"{flag}: {busy} is training {path}; expects another run") from None
             except OSError as error:
                 raise _cannot_write(self.plan, error) from None
             yield
