@@ -12,7 +12,8 @@ import sys
 import time
 import uuid
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import redirect_stderr, suppress
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,6 @@ from experiments.launchers.slurm_job import CellJob
 from experiments.launchers.slurm_options import Options
 from experiments.launchers.slurm_options import parse as parse_options
 from experiments.launchers.slurm_records import Submitted
-from sqt_jax.one_line import one_line
 
 FOLDER = ".slurm"  # in --out: submitit's files, and what the jobs print
 POLL_SECONDS = 5.0  # between two questions to SLURM, one for all jobs
@@ -52,7 +52,7 @@ class SlurmLauncher:
         self.already_queued: dict[Cell, Submitted] = {}
         self._out, self._array, self._clock, self._sleep = out, array, clock, sleep
         self._jobs: dict[Cell, Submitted] = {}
-        self._over_since: dict[Cell, float] = {}
+        self._over: dict[Cell, tuple[float, slurm_queue.Job | None]] = {}  # since when, and what SLURM said then
         self._next_poll = 0.0
         self._cancels = 0
 
@@ -93,7 +93,7 @@ class SlurmLauncher:
         found = [ended for cell in [*self._jobs] if (ended := self._ended(cell, queue.get(self._jobs[cell].job)))]
         for ended in found:
             del self._jobs[ended.cell]
-            self._over_since.pop(ended.cell, None)
+            self._over.pop(ended.cell, None)
         return found
 
     def cancel(self) -> None:
@@ -112,9 +112,9 @@ class SlurmLauncher:
     def _ended(self, cell: Cell, job: slurm_queue.Job | None) -> Ended | None:
         """How a cell has ended; None if its job is not over, or its files may not be visible yet."""
         if job and not job.over:
-            self._over_since.pop(cell, None)
+            self._over.pop(cell, None)
             return None
-        since = self._over_since.setdefault(cell, self._clock())
+        since, job = self._over.setdefault(cell, (self._clock(), job))  # SLURM may forget it while files are awaited
         waited = self._cancels > 0 or self._clock() - since >= SHARING_SECONDS
         return outcome(cell, job, self._jobs[cell], self._out, waited)
 
@@ -157,30 +157,30 @@ def outcome(cell: Cell, job: slurm_queue.Job | None, submitted: Submitted, out: 
     if ended := read_ended(cell):
         # The job has saved, and SLURM has ended it. If a user cancelled it, it stays so.
         return ended._replace(lost=ended.lost and not (ended.code == INTERRUPTED and state == "CANCELLED"))
-    if state == "CANCELLED" and not submitted.log.exists():
+    lines = _last_lines(submitted.log)
+    if state == "CANCELLED" and lines is None:
         return Ended(cell, INTERRUPTED, f"job {submitted.job} was cancelled before it started")
+    if refusal := next((line for line in lines or () if line.startswith(REFUSALS)), None):
+        return Ended(cell, BAD_USAGE, refusal)
     if not waited:
         return None
-    if not submitted.log.exists():
+    if lines is None:
         node = job.node if job and job.node != "n/a" else "the job's machine"
         text = f"--out={out}: expects a folder that all machines share; {node} does not see it"
         return Ended(cell, BAD_USAGE, f"{text} (job {submitted.job}: {state})")
-    lines = _last_lines(submitted.log)
-    for line in lines:
-        if line.startswith(REFUSALS):
-            return Ended(cell, BAD_USAGE, line)
-    return Ended(cell, FAILED, f"job {submitted.job} was lost ({state}): {lines[-1]}", lost=True)
+    last = lines[-1] if lines else "it printed nothing"
+    return Ended(cell, FAILED, f"job {submitted.job} was lost ({state}): {last}", lost=True)
 
 
-def _last_lines(path: Path) -> list[str]:
-    """At least one."""
+def _last_lines(path: Path) -> list[str] | None:
+    """The last lines of a job's log; None if there is no log."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - TAIL_BYTES))
             lines = file.read().decode(errors="replace").split("\n")
-    except OSError as error:
-        return [one_line(error)]
-    return [printable(line.strip())[:500] for line in lines if line.strip()] or ["it printed nothing"]
+    except OSError:
+        return None
+    return [printable(line.strip())[:500] for line in lines if line.strip()]
 
 
 def make(out: Path, max_jobs: int | None, slurm: str | None, slurm_setup: str | None) -> SlurmLauncher:
@@ -215,7 +215,8 @@ def submit_array(submission: Submission, cells: Sequence[Cell]) -> list[Submitte
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         functions: list[Any] = [CellJob(cell, token, str(submission.out)) for cell in cells]
-        jobs = executor.submit_array(functions)
+        with redirect_stderr(StringIO()):  # sbatch's errors, which are in the exception too
+            jobs = executor.submit_array(functions)
     except (FailedJobError, FailedSubmissionError, OSError) as error:
         shutil.rmtree(folder, ignore_errors=True)
         text = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
