@@ -21,7 +21,7 @@ from experiments.grids import status
 from experiments.grids.grid import GRIDS, OWN_GRID, make_cells, needs_training
 from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import repeat_command, submit_and_leave, train_cells
-from experiments.launchers import slurm_records
+from experiments.launchers import slurm_status
 from experiments.launchers.choice import LAUNCHERS, LauncherOptions, make_launcher
 from experiments.launchers.slurm import SlurmLauncher
 
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
         out = Path(FLAGS.out)
         cells = make_cells(FLAGS.grid, FLAGS.algos, FLAGS.tasks, out, argv[1:], _seeds_per_cell(FLAGS.split))
         if FLAGS.status:
-            _say(*status.status_lines(cells, slurm_records.queue_texts(cells)))
+            _say(*status.status_lines(cells, slurm_status.job_texts(cells, out)))
             return DONE
         if FLAGS.dry_run:
             _say(*(repeat_command(cell) for cell in cells if needs_training(cell)))

@@ -61,18 +61,20 @@ def _save_seconds(text: str | None, time: str | None) -> int:
     limit = seconds(time) if time else None
     if text is None:
         return SAVE_SECONDS if limit is None else min(SAVE_SECONDS, limit // 2)
-    if not (text.isascii() and text.isdecimal() and len(text) < 6 and int(text) <= 65535):  # SLURM's own limit
-        raise UsageError(f"--slurm=save_seconds={text[:50]}: expects a whole number of seconds up to 65535")
+    if not (text.isascii() and text.isdecimal() and len(text) < 6 and 0 < int(text) <= 65535):  # SLURM's own limit
+        raise UsageError(f"--slurm=save_seconds: expects a whole number of seconds from 1 to 65535, not {text[:50]!r}")
     if limit is not None and int(text) >= limit:
         raise UsageError(f"--slurm=save_seconds={text}: expects less than the time limit, {limit} seconds")
     return int(text)
 
 
 def seconds(text: str) -> int | None:
-    """A time in one of sbatch's forms, as 30, 30:00, 4:00:00, 1-12 or 1-12:00:00; None: unlimited, or not a time."""
+    """A time in one of sbatch's forms, as 30, 30:00, 4:00:00, 1-12 or 1-12:00:00; None: no limit, or not a time."""
     match = TIME.fullmatch(text)
-    if not match:
-        return None
+    return _seconds(match) or None if match else None
+
+
+def _seconds(match: re.Match[str]) -> int:
     parts = [int(part) for part in match.group("first", "second", "third") if part is not None]
     if match["days"] is not None:
         hours, minutes, rest = [*parts, 0, 0][:3]

@@ -1,8 +1,7 @@
 """Which job of SLURM trains a cell: a small file beside the run's folder, read by later commands."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,16 +50,3 @@ def in_queue(cells: Iterable[Cell]) -> dict[Cell, tuple[Submitted, Job]]:
     jobs = slurm_queue.jobs()
     active = {cell: (submitted, jobs[submitted.job]) for cell, submitted in found.items() if submitted.job in jobs}
     return {cell: (submitted, job) for cell, (submitted, job) in active.items() if not job.over}
-
-
-def queue_texts(cells: Sequence[Cell]) -> Mapping[Cell, tuple[str, str]]:
-    """For `sweep --status`: `waiting` or `running`, and the job, of cells in the queue; empty without SLURM."""
-    with suppress(slurm_queue.CommandError):
-        return {
-            cell: (
-                "waiting" if job.state in ("PENDING", "REQUEUE_HOLD", "SPECIAL_EXIT") else "running",
-                f"job {submitted.job} ({job.state if job.reason == 'None' else job.reason})",
-            )
-            for cell, (submitted, job) in in_queue(cells).items()
-        }
-    return {}
