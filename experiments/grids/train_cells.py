@@ -9,6 +9,7 @@ from experiments.grids.grid import finished, needs_training
 from experiments.grids.status import progress_text, scores
 from experiments.launchers.cell import Cell, Ended
 from experiments.launchers.launcher import Launcher
+from experiments.launchers.slurm import SlurmLauncher
 from experiments.running.progress import format_seconds
 
 WORST_FIRST = (INTERRUPTED, FAILED, BAD_USAGE, DIVERGED, DONE)
@@ -76,6 +77,16 @@ def train_cells(
     for line in _failures(over):
         say(line)
     return min((_exit_code(ended) for ended in over), key=WORST_FIRST.index, default=DONE)
+
+
+def submit_and_leave(cells: Sequence[Cell], launcher: SlurmLauncher, say: Callable[[str], None]) -> int:
+    """Submits the cells that are not finished, and do not wait or run already. Returns the exit code."""
+    todo = [cell for cell in cells if needs_training(cell)]
+    launcher.submit(todo)
+    queued = len(launcher.already_queued)
+    say(f"{len(cells)} runs, {len(cells) - len(todo)} of them finished, {queued} already submitted")
+    say(f"{len(todo) - queued} submitted; the same command with --status shows them")
+    return DONE
 
 
 def repeat_command(cell: Cell) -> str:
