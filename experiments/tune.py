@@ -14,6 +14,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from absl import app, flags
 
@@ -45,7 +46,8 @@ def main(argv: Sequence[str]) -> int:
         options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
         reject_folder("--out", options.out)
         here = FLAGS.launcher == "local"
-        launcher = LauncherOptions(launcher=FLAGS.launcher, workers=FLAGS.workers if here else None, out=options.out)
+        own: dict[str, Any] = {name: FLAGS[name].value for name in ("launcher", "max_jobs", "slurm", "slurm_setup")}
+        launcher = LauncherOptions(out=options.out, workers=FLAGS.workers if here else None, **own)
         first = [make_launcher(launcher)]  # now, so that its flags are checked
         return tune(options, lambda: first.pop() if first else make_launcher(launcher), FLAGS.workers if here else 0)
     except UsageError as error:
@@ -86,5 +88,8 @@ if __name__ == "__main__":
     define_path("out", "runs/tuned", "The folder of the study. On a cluster: one that all machines share.")
     flags.DEFINE_string("launcher", "local", f"Where runs are started: {', '.join(LAUNCHERS)}.")
     flags.DEFINE_integer("workers", 1, "Batches that are asked for and trained side by side.", 1)
+    flags.DEFINE_integer("max_jobs", None, "With slurm: jobs of the array that run at the same time; default: all.", 1)
+    flags.DEFINE_string("slurm", None, "With slurm: options of sbatch, as partition=gpu,gpus_per_node=1,time=04:00:00.")
+    define_path("slurm_setup", None, "With slurm: a file of shell lines that each job runs first, as module load cuda.")
     flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
     app.run(main, flags_parser=parse_known)
