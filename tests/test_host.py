@@ -1,6 +1,10 @@
 """Environments on the host: their contract, a test per sentence, in this process and in others."""
 
 import functools
+import gc
+import multiprocessing
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -181,11 +185,30 @@ def test_processes_play_the_same_episodes():
     env.host.close()  # does nothing
 
 
-def test_a_process_that_ends_is_an_error():
+def test_a_process_that_ends_is_an_error_until_the_next_reset():
     env = counter(1, exits_at=2)
     assert bool(env.host.failed(play([GO] * 3, env=env)[-1]))
     assert "a worker process ended by itself (exit codes: [7])" in env.host.error().text
+    assert play([GO], env=env)[-1].reward == 1 and env.host.error() is None
     env.host.close()
+
+
+def test_an_environment_that_nobody_has_any_more_leaves_no_thread_and_no_process():
+    def used(processes):
+        env = counter(processes)
+        play([GO], env=env)
+
+    def here():
+        gc.collect()
+        return {*threading.enumerate(), *multiprocessing.active_children()}
+
+    before = here()
+    used(0)
+    used(1)
+    deadline = time.monotonic() + 20
+    while here() - before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not here() - before
 
 
 def test_on_an_accelerator_the_call_is_pure_and_plays_the_same(monkeypatch):

@@ -1,12 +1,14 @@
 """The state of a grid's runs from their files."""
 
 import json
+import os
 
 import pytest
 from made_runs import write_run
 
 from experiments.grids.status import Progress, state_of, status_lines
 from experiments.launchers.cell import Cell, Ended, write_ended
+from experiments.running import folder_lock
 
 
 @pytest.fixture
@@ -54,6 +56,20 @@ def test_a_run_that_was_interrupted_says_how_far_it_is(cell, ended, text):
         write_ended(ended._replace(cell=cell))
     # 10 s for 100 steps, by the table's last row
     assert state_of(cell) == ("interrupted", f"step 100 of 200, 0:10 left{text}")
+
+
+def test_a_run_that_is_locked_is_running(cell):
+    begin(cell, steps=200)
+    with folder_lock.locked(cell.path):
+        word, text = state_of(cell)
+        assert (
+            word == "running" and text.startswith("step 100 of 200, 0:10 left (") and f"process {os.getpid()}" in text
+        )
+        write_ended(Ended(cell, 1, "killed by SIGKILL", lost=True))  # the lock's record still looks alive
+        os.utime(cell.path / "lock", (0, cell.ended_file.stat().st_mtime - 1))
+        assert state_of(cell).word == "interrupted"
+        cell.ended_file.unlink()
+    assert state_of(cell).word == "interrupted"
 
 
 def test_a_run_whose_folder_was_removed_waits(cell):

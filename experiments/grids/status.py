@@ -1,12 +1,13 @@
 """The state of a grid's runs, read from their files: from any machine that shares the folder."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import DIVERGED, DONE
 from experiments.grids.grid import finished
 from experiments.launchers.cell import Cell, read_ended
-from experiments.running import records, run_config
+from experiments.running import folder_lock, records, run_config
 from experiments.running.progress import format_seconds
 
 
@@ -45,6 +46,10 @@ def state_of(cell: Cell) -> State:
     if summary := finished(cell):
         return State("done", scores(summary))
     ended = read_ended(cell)
+    holder = folder_lock.holder(cell.path)
+    if holder and holder.alive and (ended is None or _is_newer(cell.path / "lock", cell.ended_file)):
+        names = [holder.host, f"process {holder.process}", *([f"job {holder.job}"] if holder.job else [])]
+        return State("running", f"{_progress(cell)} ({', '.join(names)})")
     if ended is None:
         begun = (cell.path / run_config.NAME).exists()
         return State("interrupted" if begun else "waiting", _progress(cell) if begun else "")
@@ -81,6 +86,13 @@ def scores(summary: dict[str, Any] | None) -> str:
     parts = ["none" if s["mean"] is None else f"{s['mean']:,.0f} +- {s['std']:,.0f}" for s in found]
     lost = len(summary["diverged"])
     return f"score {', '.join(parts)}" + (f" ({lost} diverged)" if lost else "")
+
+
+def _is_newer(path: Path, other: Path) -> bool:
+    try:
+        return path.stat().st_mtime > other.stat().st_mtime
+    except OSError:
+        return False
 
 
 def _progress(cell: Cell) -> str:
