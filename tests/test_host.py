@@ -3,6 +3,8 @@
 import functools
 import gc
 import multiprocessing
+import os
+import signal
 import threading
 import time
 
@@ -13,6 +15,7 @@ import pytest
 from host_tasks import Counter
 
 from sqt_jax.envs.host import host_environment
+from sqt_jax.envs.host_episodes import PlayingThread
 
 GO, END, CUT = [0.5, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]
 BAD_OBS, BAD_REWARD = [0.1, 0.0, -1.0], [0.1, 0.0, 1.0]
@@ -191,6 +194,23 @@ def test_a_process_that_ends_is_an_error_until_the_next_reset():
     assert "a worker process ended by itself (exit codes: [7])" in env.host.error().text
     assert play([GO], env=env)[-1].reward == 1 and env.host.error() is None
     env.host.close()
+
+
+def test_a_wait_that_ctrl_c_ends_does_not_give_its_result_to_the_next_call():
+    thread, release = PlayingThread(), threading.Event()
+
+    def late():
+        os.kill(os.getpid(), signal.SIGINT)
+        return release.wait(60)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            thread.run(late)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        release.set()
+    assert thread.run(lambda: "next") == "next"
 
 
 def test_an_environment_that_nobody_has_any_more_leaves_no_thread_and_no_process():

@@ -164,15 +164,13 @@ class PlayingThread:
 
     def __init__(self) -> None:
         self.todo: queue.SimpleQueue = queue.SimpleQueue()
-        self.done: queue.SimpleQueue = queue.SimpleQueue()
-        self.lock = threading.Lock()
         threading.Thread(target=self._serve, daemon=True, name="host environments").start()
 
     def run(self, work: Callable[[], Any]) -> Any:
         """The result of `work()`, run in the thread; its exception is raised here."""
-        with self.lock:
-            self.todo.put(work)
-            result, error = self.done.get()
+        done: queue.SimpleQueue = queue.SimpleQueue()  # its own: Ctrl-C may end the wait, and the next work follows
+        self.todo.put((work, done))
+        result, error = done.get()
         if error is not None:
             raise error
         return result
@@ -182,12 +180,13 @@ class PlayingThread:
         self.todo.put(None)
 
     def _serve(self) -> None:
-        while (work := self.todo.get()) is not None:
+        while (asked := self.todo.get()) is not None:
+            work, done = asked
             try:
-                self.done.put((work(), None))
+                done.put((work(), None))
             except BaseException as error:
-                self.done.put((None, error))
-            del work  # it holds the episodes, which nobody else may need any more
+                done.put((None, error))
+            del asked, work  # they hold the episodes, which nobody else may need any more
 
 
 def host_error(error: BaseException) -> HostError:
