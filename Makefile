@@ -26,7 +26,7 @@ test: $(STAMP)  ## all tests except the slow ones
 
 test-engines: $(STAMP)  ## the tests that start SLURM or Ray
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,slurm]'
-	$(BIN)/python -m pytest -m engine
+	$(BIN)/python -m pytest -m engine tests/test_*_cluster.py
 
 test-all: $(STAMP)  ## all tests, compiled as users' programs are
 	XLA_FLAGS= $(BIN)/python -m pytest -n 2 --dist loadfile

@@ -64,6 +64,13 @@ def missing() -> str | None:
     return None
 
 
+def can_hide() -> bool:
+    """Whether a node can be kept from seeing a folder. In a container that may be forbidden."""
+    return (
+        subprocess.run(["unshare", "-m", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode == 0
+    )
+
+
 class Cluster(NamedTuple):
     """A running SLURM."""
 
