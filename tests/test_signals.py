@@ -52,6 +52,13 @@ def test_a_sigterm_that_comes_twice_at_once_is_one():
     assert [requests.add(signal.SIGTERM, at) for at in (100.0, 100.9, 102.0)] == [False, False, True]
 
 
+def test_in_a_job_of_a_cluster_all_sigterms_are_one(monkeypatch):
+    monkeypatch.setenv("SQT_JOB", "slurm 7")
+    requests = signals.Requests()
+    assert [requests.add(signal.SIGTERM, at) for at in (100.0, 102.0, 110.0)] == [False, False, False]
+    assert requests.add(signal.SIGINT, 110.0)
+
+
 def test_the_handlers_are_the_old_ones_afterwards():
     before = [signal.getsignal(number) for number in signals.SIGNALS]
     with signals.stop_on_signal():

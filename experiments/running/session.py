@@ -264,6 +264,7 @@ class Session:
             display=self.display,
             stop=stop,
             failed=lambda: self._environment_error() is not None,
+            keeps_failed=not self.plan.layout.spread,
             start=self.restored.position if self.restored else START,
             checkpoint_every=self.plan.output["checkpoint_every"],
             save=save,

@@ -25,10 +25,12 @@ class Requests:
     """The signals that have asked to stop.
 
     A SIGTERM within a second of another one counts as the same: with a batch system, both the system and
-    `experiments.sweep`, which forwards its own, send one to this process.
+    `experiments.sweep`, which forwards its own, send one to this process. In a job that a launcher started on a
+    cluster (the variable SQT_JOB), all SIGTERMs do: SLURM's scancel may repeat one.
     """
 
     def __init__(self) -> None:
+        self.same_seconds = math.inf if "SQT_JOB" in os.environ else SAME_SIGNAL_SECONDS
         self.last_sigterm = -math.inf
         self.received: list[int] = []
 
@@ -36,7 +38,7 @@ class Requests:
         """Whether the signal `number` at the time `now`, in seconds, is the second SIGINT or SIGTERM."""
         if number == signal.SIGTERM:
             since, self.last_sigterm = now - self.last_sigterm, now
-            if since < SAME_SIGNAL_SECONDS:
+            if since < self.same_seconds:
                 return False
         second = number in SIGNALS and any(earlier in SIGNALS for earlier in self.received)
         self.received.append(number)
