@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
         options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
         reject_folder("--out", options.out)
         here = FLAGS.launcher == "local"
-        own: dict[str, Any] = {name: FLAGS[name].value for name in ("launcher", "max_jobs", "slurm", "slurm_setup")}
+        own: dict[str, Any] = {name: FLAGS[name].value for name in ("launcher", "max_jobs", "slurm", "slurm_setup", "ray")}
         launcher = LauncherOptions(out=options.out, workers=FLAGS.workers if here else None, **own)
         first = [make_launcher(launcher)]  # now, so that its flags are checked
         return tune(options, lambda: first.pop() if first else make_launcher(launcher), FLAGS.workers if here else 0)
@@ -91,5 +91,6 @@ if __name__ == "__main__":
     flags.DEFINE_integer("max_jobs", None, "With slurm: jobs of the array that run at the same time; default: all.", 1)
     flags.DEFINE_string("slurm", None, "With slurm: options of sbatch, as partition=gpu,gpus_per_node=1,time=04:00:00.")
     define_path("slurm_setup", None, "With slurm: a file of shell lines that each job runs first, as module load cuda.")
+    flags.DEFINE_string("ray", None, "With ray: resources of a run, as num_cpus=2,num_gpus=1,resources.NAME=1.")
     flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
     app.run(main, flags_parser=parse_known)

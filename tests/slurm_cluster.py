@@ -1,6 +1,7 @@
-"""A SLURM of two nodes on this machine, for tests: its own configuration, key and folders, no installed service.
+"""A SLURM of two nodes on this machine: its own configuration, key and folders, no installed service.
 
-Each node is a `slurmd` on one core of its own. Starts as root only, from Debian's packages slurm-wlm and munge.
+For tests, and `python tests/slurm_cluster.py COMMAND...` runs a command beside one, for example a shell. Each node is a
+`slurmd` on one core of its own. Starts as root only, from Debian's packages slurm-wlm and munge.
 """
 
 import os
@@ -8,6 +9,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -60,6 +62,13 @@ def missing() -> str | None:
     if len(os.sched_getaffinity(0)) < len(NODES):
         return f"expects {len(NODES)} cores, one for each node"
     return None
+
+
+def can_hide() -> bool:
+    """Whether a node can be kept from seeing a folder. In a container that may be forbidden."""
+    return (
+        subprocess.run(["unshare", "-m", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode == 0
+    )
 
 
 class Cluster(NamedTuple):
@@ -134,6 +143,15 @@ def cluster(requeue_seconds: int = 6, hidden: Path | None = None) -> Iterator[Cl
         yield running
 
 
+def main(command: Sequence[str]) -> int:
+    """Runs a command beside a SLURM of its own; returns its exit code."""
+    if reason := missing():
+        print(reason, file=sys.stderr)
+        return 2
+    with cluster() as running:
+        return subprocess.run(command, env=running.variables).returncode
+
+
 def _idle(running: Cluster) -> int:
     try:
         return running.call("sinfo", "-h", "-N", "-o", "%T").split().count("idle")
@@ -174,3 +192,7 @@ def _free_ports(count: int) -> Sequence[int]:
         for each in sockets:
             each.bind(("127.0.0.1", 0))
         return [each.getsockname()[1] for each in sockets]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:] or ["bash"]))

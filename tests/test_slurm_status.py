@@ -30,7 +30,7 @@ def test_each_job_has_a_word_and_a_text(cells, monkeypatch, tmp_path):
     write_ended(Ended(cells[4], 1, "the run's own error"))
     assert job_texts(cells, tmp_path) == {
         cells[0]: ("waiting", "job 1_0 (Resources)"),
-        cells[1]: ("running", "job 1_1 (RUNNING)"),
+        cells[1]: ("running", "job 1_1"),
         cells[2]: ("failed", "--launcher=slurm: expects x on all machines; n1 does not have it"),
         cells[3]: ("interrupted", "job 1_3 was lost (forgotten by SLURM): it printed nothing"),
     }  # of the fifth the run's files say how it ended, and the sixth never had a job

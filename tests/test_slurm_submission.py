@@ -1,5 +1,6 @@
 """The script of a job array."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from experiments.commandline.arguments import UsageError
 from experiments.launchers.cell import Cell
 from experiments.launchers.slurm_options import parse
-from experiments.launchers.slurm_submission import Submission, checks, parameters, submit_array
+from experiments.launchers.slurm_submission import Submission, checks, parameters, submit_array, variables_of_no_job
 
 CELLS = [Cell("ant", algo, Path(f"runs/ant/{algo}/x"), ()) for algo in ("td3", "sac", "td7")]
 
@@ -60,6 +61,19 @@ def test_the_error_of_sbatch_is_one_line_and_leaves_no_folder(sbatch, tmp_path, 
     line = "--slurm: expects options that sbatch accepts: sbatch: error: invalid partition; sbatch: error: failed"
     assert str(error.value) == line
     assert not any((tmp_path / "out" / ".slurm").iterdir()) and capfd.readouterr() == ("", "")
+
+
+def test_a_job_that_is_submitted_from_a_job_does_not_take_over_its_variables(monkeypatch):
+    monkeypatch.setenv("SLURM_CONF", "/etc/slurm.conf")
+    monkeypatch.setenv("SLURM_MEM_PER_CPU", "4")  # outside of a job: the user's own
+    with variables_of_no_job():
+        assert os.environ["SLURM_MEM_PER_CPU"] == "4"
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    monkeypatch.setenv("SQT_JOB", "slurm 7")
+    with variables_of_no_job():
+        assert not {"SLURM_MEM_PER_CPU", "SLURM_JOB_ID", "SQT_JOB"} & set(os.environ)
+        assert os.environ["SLURM_CONF"] == "/etc/slurm.conf"
+    assert os.environ["SLURM_JOB_ID"] == "7"
 
 
 def test_setup_lines_come_before_the_checks():

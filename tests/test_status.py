@@ -78,6 +78,21 @@ def test_a_run_whose_folder_was_removed_waits(cell):
     assert state_of(cell) == ("waiting", "")
 
 
+def test_a_batch_system_knows_more_than_the_files(cell):
+    waiting, running, failed = (
+        ("waiting", "job 1_0 (Priority)"),
+        ("running", "job 1_0"),
+        ("failed", "--out: no"),
+    )
+    assert state_of(cell, waiting) == waiting and state_of(cell, failed) == failed
+    assert state_of(cell, running) == ("running", "before its first evaluation; job 1_0")
+    begin(cell, steps=200)
+    assert state_of(cell, waiting) == ("waiting", "step 100 of 200, 0:10 left; job 1_0 (Priority)")
+    write_ended(Ended(cell, 1, "why"))  # written by the run itself, later than what ended the job
+    assert state_of(cell, failed) == ("failed", f"why; log: {cell.log}")
+    assert status_lines([cell], {cell: waiting})[-1] == "1 runs: 1 waiting"
+
+
 def test_time_left_is_not_known_before_a_step():
     assert Progress(0, 100, 3.0).seconds_left is None
     assert Progress(25, 100, 3.0).seconds_left == 9.0

@@ -26,8 +26,9 @@ def job_texts(cells: Sequence[Cell], out: Path) -> dict[Cell, tuple[str, str]]:
     for cell, submitted in found.items():
         job = queue.get(submitted.job)
         if job and not job.over:
-            detail = job.state if job.reason == "None" else job.reason
-            texts[cell] = ("waiting" if job.state in WAITING else "running", f"job {submitted.job} ({detail})")
+            detail = job.state.lower() if job.reason == "None" else job.reason
+            text = f"job {submitted.job}" + ("" if job.state == "RUNNING" else f" ({detail})")
+            texts[cell] = ("waiting" if job.state in WAITING else "running", text)
         elif read_ended(cell) is None and (ended := outcome(cell, job, submitted, out, waited=True)):
             texts[cell] = ("failed" if ended.code == BAD_USAGE else "interrupted", ended.reason)
     return texts

@@ -11,8 +11,8 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Sequence
-from contextlib import redirect_stderr
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from experiments.launchers.slurm_job import CellJob
 from experiments.launchers.slurm_options import Options
 from experiments.launchers.slurm_records import Submitted
 
+VARIABLES_OF_A_JOB = ("SLURM_", "SLURMD_", "SRUN_", "SUBMITIT_", "SQT_JOB")
 FOLDER = ".slurm"  # in --out: submitit's files, and what the jobs print
 
 
@@ -50,7 +51,8 @@ def submit_array(submission: Submission, cells: Sequence[Cell]) -> list[Submitte
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         functions: list[Any] = [CellJob(cell, token, str(submission.out)) for cell in cells]
-        with redirect_stderr(StringIO()):  # sbatch's errors, which are in the exception too
+        # sbatch's errors are in the exception too.
+        with redirect_stderr(StringIO()), variables_of_no_job():
             jobs = executor.submit_array(functions)
     except (FailedJobError, FailedSubmissionError, OSError) as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -59,6 +61,17 @@ def submit_array(submission: Submission, cells: Sequence[Cell]) -> list[Submitte
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return [Submitted(job.job_id, job.paths.stdout) for job in jobs]
+
+
+@contextmanager
+def variables_of_no_job() -> Iterator[None]:
+    """Hides the environment variables of the job that this process may be part of: its jobs would take them over."""
+    names = [name for name in os.environ if name.startswith(VARIABLES_OF_A_JOB) and name != "SLURM_CONF"]
+    hidden = {name: os.environ.pop(name) for name in names if "SLURM_JOB_ID" in names}
+    try:
+        yield
+    finally:
+        os.environ.update(hidden)
 
 
 def parameters(submission: Submission, cells: Sequence[Cell]) -> dict[str, Any]:
