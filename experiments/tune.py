@@ -46,7 +46,8 @@ def main(argv: Sequence[str]) -> int:
         options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
         reject_folder("--out", options.out)
         here = FLAGS.launcher == "local"
-        own: dict[str, Any] = {name: FLAGS[name].value for name in ("launcher", "max_jobs", "slurm", "slurm_setup", "ray")}
+        names = ("launcher", "max_jobs", "slurm", "slurm_setup", "ray")
+        own: dict[str, Any] = {name: FLAGS[name].value for name in names}
         launcher = LauncherOptions(out=options.out, workers=FLAGS.workers if here else None, **own)
         first = [make_launcher(launcher)]  # now, so that its flags are checked
         return tune(options, lambda: first.pop() if first else make_launcher(launcher), FLAGS.workers if here else 0)
