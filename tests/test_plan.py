@@ -115,7 +115,8 @@ def test_a_folder_needs_no_other_flags(tmp_path):
     assert again.members == made.members
 
 
-DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
+DEFAULTS = {"checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
+DEFAULTS |= {"tensorboard": True, "wandb": ""}
 
 
 @pytest.mark.parametrize(
