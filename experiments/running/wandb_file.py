@@ -13,17 +13,10 @@ MAX_BYTES = 10_000
 
 
 class Sent(NamedTuple):
-    """What W&B was sent so far. Steps are environment steps of the last row; -1: none."""
+    """What was given to W&B so far."""
 
     id: str  # a member's run is `id-INDEX`
-    online: int = -1  # to the server
-    offline: int = -1  # to files of the offline mode, which `wandb sync` sends later
-
-    def with_row(self, env_steps: int, offline: bool) -> "Sent":
-        """With the row at `env_steps`, sent to the server or to files."""
-        if offline:
-            return self._replace(offline=max(self.offline, env_steps))
-        return self._replace(online=max(self.online, env_steps))
+    env_steps: int = -1  # of the last row; -1: none
 
 
 def read(folder: Path) -> Sent:
@@ -34,7 +27,7 @@ def read(folder: Path) -> Sent:
     except (OSError, ValueError, TypeError):
         return _new()
     valid = isinstance(sent.id, str) and re.fullmatch(r"[0-9a-f]{12}", sent.id)
-    return sent if valid and type(sent.online) is type(sent.offline) is int else _new()
+    return sent if valid and type(sent.env_steps) is int else _new()
 
 
 def write(folder: Path, sent: Sent) -> None:

@@ -3,13 +3,14 @@
 No row is sent twice, and no fault of W&B costs the run:
 
 - W&B cannot replace rows, and a resumed run makes the rows after its checkpoint again. So a row is left out if W&B has
-  it. The server says which row is its last; those of the tables that it lacks are sent first. Files of the offline mode
-  are not read: before a row is written there, wandb.json says so. A kill between the two loses this row.
+  it. The server says which row is its last; those of the tables that it lacks are sent first.
+- Offline nobody can be asked: before a row is given to the package, wandb.json says so. A kill between the two loses
+  this row.
 - Every call of the package is made in a thread, with a time limit. After an error or the limit, one line says that W&B
   has ended, and training continues.
 - The package is silent, asks for nothing, and captures neither output nor code.
 
-API: https://docs.wandb.ai/ref/python/sdk/functions/init, .../classes/settings.
+API: https://docs.wandb.ai/models/ref/python
 """
 
 import os
@@ -117,12 +118,14 @@ class WandbRuns:
 
         self._runs = in_threads(start, range(len(members)), OPEN_THREADS, OPEN_SECONDS)
         if self._offline:
-            self._first = [max(self._sent.online, self._sent.offline) + 1] * len(members)
-            files = self.folder / FOLDER / "offline-run-*"
-            self.where = f"W&B is offline: `wandb sync {files}` sends the rows later"
+            self._first = [self._sent.env_steps + 1] * len(members)
+            self.where = f"W&B is offline: `wandb sync {self.folder / FOLDER}/offline-run-*` sends the rows later"
         else:
-            self._first = [max(run.starting_step, self._sent.offline + 1) for run in self._runs]
+            self._first = [run.starting_step for run in self._runs]
             self.where = f"W&B: the group {self._runs[0].group} of {self._runs[0].project_url}"
+            # The server gets the rows from the tables: `wandb sync` would number those of the files anew.
+            for file in self.folder.glob(f"{FOLDER}/offline-run-*-{self._sent.id}-*/*.wandb"):
+                file.with_name(f"{file.name}.synced").touch()
         return True
 
     def add(self, rows: Sequence[Mapping[str, float]], env_steps: int) -> None:
@@ -136,10 +139,9 @@ class WandbRuns:
                     run.log(dict(values), step=env_steps, commit=True)
 
         try:
-            sent = self._sent.with_row(env_steps, self._offline)
-            if sent != self._sent:
-                wandb_file.write(self.folder, sent)
-                self._sent = sent
+            if env_steps > self._sent.env_steps:
+                self._sent = self._sent._replace(env_steps=env_steps)
+                wandb_file.write(self.folder, self._sent)
             in_threads(send, [None], 1, SEND_SECONDS)
         except Exception as error:
             self._runs = []
