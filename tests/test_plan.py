@@ -131,6 +131,10 @@ DEFAULTS |= {"tensorboard": True, "wandb": ""}
         ({"devices": 99}, ["--devices=1"], {"devices": 1}),
         ({"devices": 0}, [], {}),
         ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
+        ({"wandb": "ants"}, [], {"wandb": "ants"}),
+        ({"wandb": "ants"}, ["--wandb=bees"], {"wandb": "bees"}),
+        ({"wandb": "ants"}, ["--nowandb"], {"wandb": ""}),
+        ({"wandb": True}, [], {}),
         # Values that no command line could have given are ignored.
         ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
         ({"checkpoint_every": "often", "keep_checkpoints": True, "tensorboard": None, "more": 1}, [], {}),

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_records import outcome, report
 
+from experiments.run import main
 from experiments.running import records, wandb_runs
 from experiments.running.run_config import make_members
 from experiments.running.wandb_runs import open_runs
@@ -324,3 +325,32 @@ def test_the_callers_own_runs_are_left_alone(tmp_path, wandb, monkeypatch):
     runs.close([0, 0])
     assert wandb.calls == [("setup", None)]
     assert [run.exit_code for run in wandb.runs] == [0, 0]
+
+
+# A run from its command line
+
+TINY = (
+    "--algo=td3_sqt --env=ant --seeds=3,1 --warmup_steps=30 --eval_every=50 --eval_episodes=1 --batch_size=8 "
+    "--hidden=8,8 --name=run --checkpoint_every=50 --notensorboard"
+)
+
+
+@pytest.mark.usefixtures("shared_programs", "tiny_tasks")
+def test_a_run_and_its_resumption_send_each_row_once(tmp_path, wandb, capsys):
+    def run(*arguments):
+        assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--resume", *arguments]) == 0
+        return capsys.readouterr().out
+
+    path = tmp_path / "ant" / "td3_sqt" / "run"
+    assert "W&B: the group ant/td3_sqt/run of https://wandb.test/me/ants\n" in run("--steps=60", "--wandb=ants")
+    run("--steps=120")
+    names = [f"{json.loads((path / 'wandb.json').read_text())['id']}-{member}" for member in (0, 1)]
+    assert sorted(wandb.server) == names and len(wandb.runs) == 4
+    table = records.read_evaluations(path / "evaluations.csv")
+    for member, name in enumerate(names):
+        steps, rows = zip(*wandb.server[name], strict=True)
+        assert list(steps) == [0, 50, 60, 100, 120]
+        for column, key in (("return_mean", "eval/return_mean"), ("q_std", "train/q_std")):
+            values = records.of_member(table, member, column)
+            assert [row[key] for row in rows[1:]] == list(values[1:])
+    assert json.loads((path / "config.json").read_text())["output"]["wandb"] == "ants"
