@@ -4,10 +4,10 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help run miniature test test-all lint bench clean
+.PHONY: help run miniature test test-engines test-all lint bench clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 run: $(STAMP)  ## SAC with SQT on Ant, five seeds of 6,000 steps: about three minutes on two cores
 	$(BIN)/python -m experiments.run --algo=sac_sqt --env=ant --seeds=0,1,2,3,4 --preset=quick
@@ -23,6 +23,10 @@ miniature: $(STAMP)  ## the paper's tables 2 to 4 in small: nine algorithms, two
 
 test: $(STAMP)  ## all tests except the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+test-engines: $(STAMP)  ## the tests that start SLURM or Ray
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,slurm]'
+	$(BIN)/python -m pytest -m engine tests/test_*_cluster.py
 
 test-all: $(STAMP)  ## all tests, compiled as users' programs are
 	XLA_FLAGS= $(BIN)/python -m pytest -n 2 --dist loadfile

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -44,11 +45,12 @@ def folder(finished, tmp_path, monkeypatch):
 
 
 def snapshot(path):
-    """The contents of a folder: names, bytes and the targets of links."""
+    """The contents of a folder: names, bytes and the targets of links. Of a lock only that it is a file."""
     found = {}
     for item in path.rglob("*"):
         link = item.readlink() if item.is_symlink() else None
-        found[item.relative_to(path)] = link or (item.read_bytes() if item.is_file() else "folder or device")
+        content = "folder or device" if not item.is_file() else "lock" if item.name == "lock" else item.read_bytes()
+        found[item.relative_to(path)] = link or content
     return found
 
 
@@ -424,8 +426,8 @@ def test_a_file_at_the_path_of_a_run_is_not_replaced(folder, capsys):
 
 HOLD = """
 import sys, pathlib
-from experiments.running import files
-with files.locked(pathlib.Path(sys.argv[1])):
+from experiments.running import folder_lock
+with folder_lock.locked(pathlib.Path(sys.argv[1])):
     print("locked", flush=True)
     sys.stdin.read()
 """
@@ -437,7 +439,8 @@ def test_a_run_that_another_process_is_training_is_rejected(folder, capsys):
     root = Path(__file__).resolve().parent.parent
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=root) as holder:
         assert holder.stdout.readline() == "locked\n"
-        expects = f"process {holder.pid} is training {RUN}; expects another run"
+        who = rf"host {re.escape(platform.node())}, process {holder.pid}(, job \S+)?"
+        expects = f" {who} is training {RUN}; expects another run"
         rejected(folder, capsys, [*NEW.split(), "--name=run", "--overwrite"], "--name=run:", expects)
         rejected(folder, capsys, [f"--resume={RUN}"], f"--resume={RUN}:", expects)
         holder.stdin.close()

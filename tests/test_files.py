@@ -1,10 +1,7 @@
-"""Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
+"""Files that are complete or absent, new folders, and reading JSON that may be damaged."""
 
-import errno
 import json
 import os
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -12,83 +9,22 @@ import pytest
 
 from experiments.running import files
 
-HOLD = """
-import sys, pathlib
-from experiments.running import files
-with files.locked(pathlib.Path(sys.argv[1])):
-    print("locked", flush=True)
-    sys.stdin.read()
-"""
-
-
-@pytest.fixture
-def holder(tmp_path):
-    """A process that has locked the folder `run`."""
-    pipe, root = subprocess.PIPE, Path(__file__).resolve().parent.parent
-    command = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=root) as process:
-        assert process.stdout.readline() == "locked\n"
-        yield process
-        process.kill()
-
-
-def test_a_folder_is_locked_until_its_process_dies(tmp_path, holder):
-    with pytest.raises(files.Busy) as busy, files.locked(tmp_path / "run"):
-        pass
-    assert busy.value.process == str(holder.pid)
-    assert (tmp_path / "run" / "lock").read_text() == f"{holder.pid}\n"
-    holder.kill()  # SIGKILL: it has no time to tidy up
-    holder.wait()
-    with files.locked(tmp_path / "run"):
-        assert (tmp_path / "run" / "lock").read_text() == f"{os.getpid()}\n"
-
-
-def test_a_lock_is_released(tmp_path):
-    with pytest.raises(KeyError), files.locked(tmp_path):
-        with pytest.raises(files.Busy), files.locked(tmp_path):  # not twice in one process either
-            pass
-        raise KeyError
-    with files.locked(tmp_path):
-        pass
-
 
 @pytest.mark.parametrize("number", files.NOT_SUPPORTED)
-def test_a_file_system_without_locks_or_fsync_is_used_with_a_warning(tmp_path, monkeypatch, number):
+def test_a_file_system_without_fsync_is_used(tmp_path, monkeypatch, number):
     def refuse(*arguments):
         raise OSError(number, "not supported")
 
-    monkeypatch.setattr(files.fcntl, "flock", refuse)
     monkeypatch.setattr(files.os, "fsync", refuse)
-    lines = []
-    with files.locked(tmp_path / "run", lines.append):
-        with files.atomic_file(tmp_path / "run" / "a") as file:
-            file.write(b"content")
-        files.sync(tmp_path)
-    assert (tmp_path / "run" / "a").read_bytes() == b"content"
-    assert len(lines) == 1 and "has no locks" in lines[0]
-
-
-def test_another_error_of_a_lock_is_raised(tmp_path, monkeypatch):
-    def refuse(*arguments):
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(files.fcntl, "flock", refuse)
-    with pytest.raises(OSError, match="Input/output"), files.locked(tmp_path / "run"):
-        pass
+    with files.atomic_file(tmp_path / "a") as file:
+        file.write(b"content")
+    files.sync(tmp_path)
+    assert (tmp_path / "a").read_bytes() == b"content"
 
 
 def test_new_folders_have_different_names(tmp_path):
     made = [files.new_folder(tmp_path / "a" / "run") for _ in range(3)]
     assert [path.name for path in made] == ["run", "run-2", "run-3"] and all(path.is_dir() for path in made)
-
-
-def test_a_lock_that_is_a_link_is_not_written_through(tmp_path):
-    (tmp_path / "mine").write_text("mine")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "lock").symlink_to(tmp_path / "mine")
-    with pytest.raises(OSError), files.locked(tmp_path / "run"):
-        pass
-    assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_a_file_gets_its_name_when_it_is_complete(tmp_path):

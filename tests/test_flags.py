@@ -49,6 +49,39 @@ def test_lists_of_scalars_are_sweeps_and_single_values_are_settings():
     assert options.seeds == (7, 3)
 
 
+PAIRS = ("--paired", "--lr=1e-3,1e-3,1e-4", "--penalty_coef=0,0.5,0.5")
+
+
+def test_paired_lists_are_configurations_instead_of_a_product():
+    options = parse(*PAIRS)
+    assert options.sweep == {"penalty_coef": (0.0, 0.5, 0.5), "lr": (1e-3, 1e-3, 1e-4)}
+    assert options.configurations == [(0.0, 1e-3), (0.5, 1e-3), (0.5, 1e-4)]
+    assert parse("--paired", "--lr=1e-3,1e-4", "--tau=0.1").configurations == [(1e-3,), (1e-4,)]
+    assert parse("--paired").configurations == [()] == parse().configurations
+    assert len(parse("--lr=1e-3,1e-4", "--tau=0.1,0.2").configurations) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--lr=0.1,0.2", "--tau=0.1,0.2,0.3"), "--paired: expects lists of one length; lr has 2, tau has 3"),
+        (
+            ("--lr=0.1,0.2,0.1", "--tau=0.3,0.3,0.3"),
+            "--paired: expects each configuration once, got --lr=0.1 --tau=0.3 2 times",
+        ),
+        (("--lr=0.1,0.1",), "--paired: expects each configuration once, got --lr=0.1 2 times"),
+        (
+            (f"--lr={','.join(f'0.{number:05}' for number in range(5001))}", "--seeds=0,1"),
+            "--seeds: expects at most 10000 members, seeds times swept values, not 10002",
+        ),
+    ],
+)
+def test_lists_that_cannot_be_paired_are_rejected(arguments, message):
+    with pytest.raises(flags.UsageError) as error:
+        parse("--paired", *arguments)
+    assert str(error.value) == message
+
+
 def test_temperature_auto_is_learned():
     assert parse("--temperature=auto").settings == {"learn_temperature": True}
     assert parse("--temperature=0.1,0.2").sweep == {"temperature": (0.1, 0.2)}

@@ -1,12 +1,14 @@
 """The state of a grid's runs from their files."""
 
 import json
+import os
 
 import pytest
 from made_runs import write_run
 
 from experiments.grids.status import Progress, state_of, status_lines
 from experiments.launchers.cell import Cell, Ended, write_ended
+from experiments.running import folder_lock
 
 
 @pytest.fixture
@@ -56,10 +58,39 @@ def test_a_run_that_was_interrupted_says_how_far_it_is(cell, ended, text):
     assert state_of(cell) == ("interrupted", f"step 100 of 200, 0:10 left{text}")
 
 
+def test_a_run_that_is_locked_is_running(cell):
+    begin(cell, steps=200)
+    with folder_lock.locked(cell.path):
+        word, text = state_of(cell)
+        assert (
+            word == "running" and text.startswith("step 100 of 200, 0:10 left (") and f"process {os.getpid()}" in text
+        )
+        write_ended(Ended(cell, 1, "killed by SIGKILL", lost=True))  # the lock's record still looks alive
+        os.utime(cell.path / "lock", (0, cell.ended_file.stat().st_mtime - 1))
+        assert state_of(cell).word == "interrupted"
+        cell.ended_file.unlink()
+    assert state_of(cell).word == "interrupted"
+
+
 def test_a_run_whose_folder_was_removed_waits(cell):
     cell.path.parent.mkdir(parents=True)
     write_ended(Ended(cell, 0, ""))
     assert state_of(cell) == ("waiting", "")
+
+
+def test_a_batch_system_knows_more_than_the_files(cell):
+    waiting, running, failed = (
+        ("waiting", "job 1_0 (Priority)"),
+        ("running", "job 1_0"),
+        ("failed", "--out: no"),
+    )
+    assert state_of(cell, waiting) == waiting and state_of(cell, failed) == failed
+    assert state_of(cell, running) == ("running", "before its first evaluation; job 1_0")
+    begin(cell, steps=200)
+    assert state_of(cell, waiting) == ("waiting", "step 100 of 200, 0:10 left; job 1_0 (Priority)")
+    write_ended(Ended(cell, 1, "why"))  # written by the run itself, later than what ended the job
+    assert state_of(cell, failed) == ("failed", f"why; log: {cell.log}")
+    assert status_lines([cell], {cell: waiting})[-1] == "1 runs: 1 waiting"
 
 
 def test_time_left_is_not_known_before_a_step():

@@ -8,7 +8,7 @@ import pytest
 from experiments import run
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED
 from experiments.grids.grid import Grid, cells_of, finished
-from experiments.grids.train_cells import repeat_command, train_cells
+from experiments.grids.train_cells import repeat_command, submit_and_leave, train_cells
 from experiments.launchers.cell import Ended
 from experiments.running import loop, session
 
@@ -191,3 +191,16 @@ def test_a_diverged_member_is_a_result(tmp_path):
     assert train_cells(grid, OneByOne(in_this_process), lines.append) == DIVERGED
     assert lines[-1].startswith("1/1 td3_sqt on ant: score") and "(2 diverged)" in lines[-1]
     assert train_cells(grid, OneByOne(lambda cell: pytest.fail("it has ended")), lines.append) == DONE
+
+
+def test_what_is_submitted_can_be_left(tmp_path):
+    grid, lines = cells_of(GRID, (), (), tmp_path, TINY.split()), []
+    write_summary(grid[0])
+
+    class Left(OneByOne):
+        already_queued = {grid[1]: "its job"}
+
+    launcher = Left(lambda cell: pytest.fail("nobody waits"))
+    assert submit_and_leave(grid, launcher, lines.append) == 0 and launcher.waiting == grid[1:]
+    assert lines[0] == "4 runs, 1 of them finished, 1 already submitted"
+    assert lines[1] == "2 submitted; the same command with --status shows them"

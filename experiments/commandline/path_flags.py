@@ -18,7 +18,7 @@ class _PathParser(absl_flags.ArgumentParser):
 
 
 def define_path(
-    name: str, default: str, help: str, flag_values: absl_flags.FlagValues = absl_flags.FLAGS
+    name: str, default: str | None, help: str, flag_values: absl_flags.FlagValues = absl_flags.FLAGS
 ) -> absl_flags.FlagHolder:
     """Defines a flag whose value is a path as text; empty stays empty."""
     return absl_flags.DEFINE(_PathParser(), name, default, help, flag_values=flag_values)

@@ -1,12 +1,14 @@
 """The state of a grid's runs, read from their files: from any machine that shares the folder."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import DIVERGED, DONE
 from experiments.grids.grid import finished
 from experiments.launchers.cell import Cell, read_ended
-from experiments.running import records, run_config
+from experiments.running import folder_lock, records, run_config
 from experiments.running.progress import format_seconds
 
 
@@ -40,11 +42,24 @@ def read_progress(cell: Cell) -> Progress | None:
         return None
 
 
-def state_of(cell: Cell) -> State:
-    """The state of a cell's run."""
+def state_of(cell: Cell, job: tuple[str, str] | None = None) -> State:
+    """The state of a cell's run.
+
+    Args:
+      job: what a batch system says of it, as in `job_texts` of `experiments/launchers/slurm_status.py`.
+    """
     if summary := finished(cell):
         return State("done", scores(summary))
+    if job and job[0] in ("waiting", "running"):
+        begun = job[0] == "running" or read_progress(cell) is not None
+        return State(job[0], f"{_progress(cell)}; {job[1]}" if begun else job[1])
     ended = read_ended(cell)
+    holder = folder_lock.holder(cell.path)
+    if holder and holder.alive and (ended is None or _is_newer(cell.path / "lock", cell.ended_file)):
+        names = [holder.host, f"process {holder.process}", *([f"job {holder.job}"] if holder.job else [])]
+        return State("running", f"{_progress(cell)} ({', '.join(names)})")
+    if ended is None and job:
+        return State(*job)
     if ended is None:
         begun = (cell.path / run_config.NAME).exists()
         return State("interrupted" if begun else "waiting", _progress(cell) if begun else "")
@@ -55,9 +70,9 @@ def state_of(cell: Cell) -> State:
     return State("failed", f"{ended.reason}; log: {cell.log}")
 
 
-def status_lines(cells: Sequence[Cell]) -> list[str]:
-    """A line per cell, and one that counts the states."""
-    states = [state_of(cell) for cell in cells]
+def status_lines(cells: Sequence[Cell], jobs: Mapping[Cell, tuple[str, str]] = MappingProxyType({})) -> list[str]:
+    """A line per cell, and one that counts the states. `jobs`: as in `state_of`, of the cells that have one."""
+    states = [state_of(cell, jobs.get(cell)) for cell in cells]
     width = max((len(cell.label) for cell in cells), default=0)
     lines = [
         f"{cell.label:<{width}}  {state.word:<11}  {state.text}".rstrip()
@@ -81,6 +96,13 @@ def scores(summary: dict[str, Any] | None) -> str:
     parts = ["none" if s["mean"] is None else f"{s['mean']:,.0f} +- {s['std']:,.0f}" for s in found]
     lost = len(summary["diverged"])
     return f"score {', '.join(parts)}" + (f" ({lost} diverged)" if lost else "")
+
+
+def _is_newer(path: Path, other: Path) -> bool:
+    try:
+        return path.stat().st_mtime > other.stat().st_mtime
+    except OSError:
+        return False
 
 
 def _progress(cell: Cell) -> str:

@@ -37,6 +37,11 @@ class Cell(NamedTuple):
         """The file that says how its last process ended."""
         return self._beside(".ended.json")
 
+    @property
+    def job_file(self) -> Path:
+        """The file that says which job of a batch system trains it."""
+        return self._beside(".job.json")
+
     def _beside(self, ending: str) -> Path:
         name = self.path.name
         if len(os.fsencode(name)) > MAX_STEM:

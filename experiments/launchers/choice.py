@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.commandline.arguments import UsageError
-from experiments.launchers import local
+from experiments.launchers import local, slurm
 from experiments.launchers.launcher import Launcher
 from sqt_jax.suggestions import expects_one_of
 
@@ -14,8 +14,12 @@ class LauncherOptions(NamedTuple):
     """The flags of all launchers; None: not given."""
 
     launcher: str
-    workers: int | None  # local
     out: Path
+    workers: int | None = None  # local
+    max_jobs: int | None = None  # slurm, as all below
+    slurm: str | None = None
+    slurm_setup: str | None = None
+    detach: bool | None = None
 
 
 class Kind(NamedTuple):
@@ -27,6 +31,10 @@ class Kind(NamedTuple):
 
 LAUNCHERS = {
     "local": Kind(lambda options: local.make(options.workers or 1), ("workers",)),
+    "slurm": Kind(
+        lambda options: slurm.make(options.out, options.max_jobs, options.slurm, options.slurm_setup),
+        ("max_jobs", "slurm", "slurm_setup", "detach"),
+    ),
 }
 
 

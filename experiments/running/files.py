@@ -1,59 +1,19 @@
-"""Files that are complete or absent, folders locked by one process, and reading JSON that may be damaged."""
+"""Files that are complete or absent, new folders, and reading JSON that may be damaged."""
 
 import errno
-import fcntl
 import itertools
 import json
 import math
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 MAX_DEPTH = 20  # of nested JSON
-
-
-class Busy(Exception):
-    """Another process has locked the folder. `process` is its id, empty if unknown."""
-
-    def __init__(self, process: str):
-        super().__init__(process)
-        self.process = process
-
-
 # What a file system answers that has no such service: NFS without its lock daemon, FUSE, some clusters' own.
 NOT_SUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
-
-
-@contextmanager
-def locked(folder: Path, warn: Callable[[str], None] = lambda line: None) -> Iterator[None]:
-    """Locks `folder` for this process, by the file `lock` in it. The system unlocks it when the process ends.
-
-    Args:
-      warn: called with a line of text if the file system has no locks; the folder is not locked then.
-
-    Raises:
-      Busy: another process has locked it.
-      OSError: the folder or the file `lock` cannot be created.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise Busy(os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()) from None
-        except OSError as error:
-            if error.errno not in NOT_SUPPORTED:
-                raise
-            warn(f"the file system of {folder} has no locks ({error.strerror}): start no other process on this run")
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def new_folder(path: Path) -> Path:

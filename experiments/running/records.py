@@ -107,7 +107,7 @@ class Records:
     """Writes the tables and events of one run during training; a context manager.
 
     Args:
-      path: the run's folder, locked by this process (`files.locked`).
+      path: the run's folder, locked by this process (`folder_lock.locked`).
       swept: names of the swept settings.
       resumed_at: of a resumed run, the env steps of its checkpoint and the `lengths` there. Later rows are cut off,
         since training writes them again. None: a new run; existing tables are emptied.
