@@ -24,14 +24,16 @@ def own_environment(options: flags.Options) -> Environment | None:
     name = options.env or ""
     if not factories.is_factory(name):
         return None
-    settings = dict(options.settings)
+    settings, processes = dict(options.settings), options.env_processes
     if options.resume not in (None, flags.LATEST):
         with suppress(run_config.InvalidRunConfig):  # reported later
-            settings = run_config.read(Path(options.resume)).content["settings"] | settings
-    steps, processes = settings.get("max_episode_steps", 0), options.env_processes or 0
+            content = run_config.read(Path(options.resume)).content
+            settings = content["settings"] | settings
+            processes = content["output"].get("env_processes") if processes is None else processes
+    steps = settings.get("max_episode_steps", 0)
     try:
         arguments = env_args.parse(settings.get("env_args", ""))
-        return factories.make_from(name, arguments, steps, processes)
+        return factories.make_from(name, arguments, steps, processes if isinstance(processes, int) else 0)
     except ValueError as error:
         raise UsageError(f"--env={name}: {error}") from error
 
@@ -54,9 +56,12 @@ def main(argv: Sequence[str], env: Environment | None = None) -> int:
             jax_settings.prepare()
             env = env or own_environment(options)
             # Imports SciPy, TensorBoard and Orbax: a typing error is reported without waiting for them.
+            from experiments.running.plan import make_plan
             from experiments.running.session import start_session
 
-            return start_session(options, env, argv).run()
+            plan = make_plan(options, env)
+            with jax_settings.needed_switches():  # again: the environment's module may have changed them
+                return start_session(plan, argv).run()
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise

@@ -129,11 +129,12 @@ def env_of(config: Config, env: Environment | None = None) -> Environment:
     return env or named_env(config, config.physics)
 
 
-def named_env(config: Config, physics: str, processes: int = 0) -> Environment:
+def named_env(config: Config, physics: str, processes: int = 0, in_program: bool = True) -> Environment:
     """The environment that a configuration names.
 
     Args:
       processes: of environments on the host (`envs.host`), the processes that share them.
+      in_program: of the same, as in `gym_ids.from_gymnasium`.
 
     Raises:
       ValueError: as `envs.make`.
@@ -141,7 +142,8 @@ def named_env(config: Config, physics: str, processes: int = 0) -> Environment:
     options: dict[str, Any] = {}
     if envs.takes_arguments(config.env):
         options = {"arguments": env_args.parse(config.env_args), "max_episode_steps": config.max_episode_steps}
-        options |= {"processes": processes} if processes and physics in gym_ids.PHYSICS else {}
+    if physics in gym_ids.PHYSICS:
+        options |= {"processes": processes, "in_program": in_program}
     return envs.make(config.env, physics, **options)
 
 

@@ -10,10 +10,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from sqt_jax.types import State
+from sqt_jax.types import Array, State
 
 AXIS = "members"
 
@@ -73,6 +74,14 @@ class Layout(NamedTuple):
     def padded(self, leaf: Any) -> Any:
         """[S, ...] -> [padded_size, ...], with copies of the first members"""
         return leaf if self.padded_size == self.members else leaf[np.arange(self.padded_size) % self.members]
+
+
+def device_index() -> Array:
+    """The number of this device among those of a `Layout`: [] int32; 0 in a program for one device."""
+    try:
+        return jax.lax.axis_index(AXIS)
+    except NameError:  # the axis does not exist
+        return jnp.zeros((), jnp.int32)
 
 
 def usable_devices(members: int) -> int:

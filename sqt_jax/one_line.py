@@ -6,7 +6,11 @@ from pathlib import Path
 
 def one_line(error: BaseException, limit: int = 300) -> str:
     """Type and message of an error, at most `limit` characters."""
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")[:limit]
+    try:
+        text = f"{type(error).__name__}: {error}"
+    except Exception:  # of the error's own `__str__`
+        text = type(error).__name__
+    return " ".join(text.split()).removesuffix(":")[:limit]
 
 
 def with_place(error: BaseException, ours: str) -> str:

@@ -89,6 +89,7 @@ class Host(NamedTuple):
     error: Callable[[], HostError | None]  # the exception, also of a separate one; None: there was none
     separate: Callable[[], "Environment"]  # the same environment with episodes of its own
     close: Callable[[], None]  # closes the environments and processes of all of these
+    processes: int  # that share the environments; 0: they are in this process
     make: Callable[..., Any]  # (further keyword arguments, as render_mode="rgb_array") -> one environment
 
 

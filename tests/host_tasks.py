@@ -18,15 +18,16 @@ class Counter(gymnasium.Env):
       fails_at: raises an exception at this step, counted over all episodes; 0: never.
       exits_at: the same, but ends its process.
       seconds: how long a step takes.
+      unruly: each step changes the current folder, and `close` fails.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    def __init__(self, bad_above=2.0, fails_at=0, exits_at=0, seconds=0.0, render_mode=None):
+    def __init__(self, bad_above=2.0, fails_at=0, exits_at=0, seconds=0.0, unruly=False, render_mode=None):
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
         self.action_space = spaces.Box(-1, 1, (3,), np.float64)
         self.bad_above, self.fails_at, self.exits_at, self.seconds = bad_above, fails_at, exits_at, seconds
-        self.render_mode = render_mode
+        self.render_mode, self.unruly = render_mode, unruly
         self.made = 0
 
     def reset(self, *, seed=None, options=None):
@@ -41,13 +42,19 @@ class Counter(gymnasium.Env):
         if self.made == self.exits_at:
             os._exit(7)
         if self.made == self.fails_at:
-            raise RuntimeError("the simulator\nis gone")
+            raise RuntimeError("the simulator\nis gone") from OSError("a file's name that is not UTF-8: \udcff")
+        if self.unruly:
+            os.chdir("/")
         time.sleep(self.seconds)
         reward = np.inf if action[2] > 0.5 else self.steps
         return self._obs(action[0], action[2] < -0.5), reward, action[1] > 0.5, action[1] < -0.5, {"seed": self.seed}
 
     def render(self):
         return np.full((15, 21, 3), min(self.steps, 255), np.uint8)
+
+    def close(self):
+        if self.unruly and self.made:
+            raise RuntimeError("it is still\nin use")
 
     def _obs(self, action, broken):
         return np.array([np.nan if broken else self.start, self.steps, action])

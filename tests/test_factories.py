@@ -5,6 +5,7 @@ import pytest
 from sqt_jax.envs import factories
 
 MODULE = """
+import sys
 import jax.numpy as jnp
 import sqt_jax
 
@@ -18,6 +19,18 @@ def gym_env(**arguments):
     from host_tasks import Counter
 
     return Counter(**arguments)
+
+def leave():
+    sys.exit(0)
+
+def cannot_close():
+    import gymnasium
+
+    class Stuck(gymnasium.Env):
+        def close(self):
+            raise RuntimeError("in use")
+
+    return Stuck()
 
 def number():
     return 5
@@ -41,7 +54,9 @@ def test_the_function_of_a_module_is_called(module):
     ("function", "message"),
     [
         ("gym_env", "has no time limit, so that an evaluation might not end; add --max_episode_steps=N"),
-        ("fail", "RuntimeError: no simulator (tasks_of_a_test.py, line 9)"),
+        ("fail", "RuntimeError: no simulator (tasks_of_a_test.py, line 10)"),
+        ("leave", "SystemExit: 0 (tasks_of_a_test.py, line 18)"),
+        ("cannot_close", "RuntimeError: in use (tasks_of_a_test.py, line 25)"),
         (
             "number",
             "expects a function that returns an Environment (sqt_jax.make_environment) or a gymnasium.Env, not a int",

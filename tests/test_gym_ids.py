@@ -4,6 +4,8 @@ import functools
 import sys
 
 import gymnasium
+import jax
+import jax.numpy as jnp
 import pytest
 from gymnasium.wrappers import TimeLimit
 from host_tasks import Counter
@@ -11,6 +13,10 @@ from host_tasks import Counter
 from sqt_jax import envs
 from sqt_jax.envs import gym_ids
 from sqt_jax.envs.gym_ids import from_gymnasium, make_gym
+from sqt_jax.train import TrainState
+
+CIRCLE: list = []
+CIRCLE.append(CIRCLE)
 
 
 def test_an_environment_by_its_id():
@@ -63,6 +69,47 @@ def test_what_cannot_be_made_is_an_error_in_one_line(name, message):
     with pytest.raises(ValueError) as error:
         envs.make(name)
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_environment_with_jax_can_be_played_by_hand():
+    assert envs.make("gym:phys2d/Pendulum-v0", in_program=False).host.make().action_space.shape == (1,)
+
+
+@pytest.mark.parametrize(
+    ("kept", "holds"),
+    [
+        ({0: 1, "a": 2, None: 3}, False),  # keys that cannot be sorted
+        ({0: 1, "a": [{"b": (jnp.zeros(1),)}]}, True),
+        (TrainState(*range(len(TrainState._fields)))._replace(replay=jnp.zeros(1)), True),
+        (CIRCLE, False),
+    ],
+)
+def test_jax_is_found_in_whatever_an_environment_keeps(kept, holds):
+    env = Counter()
+    env.kept = kept
+    assert gym_ids.uses_jax(env) == holds
+
+
+@pytest.mark.parametrize("max_episode_steps", [0, 9])
+def test_a_wrapper_that_hides_the_end_of_episodes_does_not_make_them_endless(max_episode_steps):
+    class Hiding(gymnasium.Wrapper):
+        def step(self, action):
+            obs, reward, terminated, _, info = self.env.step(action)
+            return obs, reward, terminated, False, info
+
+    env = from_gymnasium("hiding", lambda: Hiding(TimeLimit(Counter(), 3)), max_episode_steps)
+    timestep, truncated = env.reset(jax.random.key(0)), []
+    for _ in range(6):
+        timestep = env.step(timestep, jnp.zeros(3))
+        truncated.append(bool(timestep.truncated))
+    assert env.episode_length == 3 and truncated == [False, False, True] * 2
+
+
+def test_arguments_of_gymnasium_itself():
+    env = make_gym("gym:host_tasks:Counter-v0", {"disable_env_checker": False, "max_episode_steps": 4})
+    assert env.episode_length == 4
+    with pytest.raises(ValueError, match="env_args: expects no max_episode_steps with --max_episode_steps, which sets"):
+        make_gym("gym:host_tasks:Counter-v0", {"max_episode_steps": 4}, max_episode_steps=5)
 
 
 def test_unknown_arguments_are_named():

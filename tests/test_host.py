@@ -1,6 +1,12 @@
 """Environments on the host: their contract, a test per sentence, in this process and in others."""
 
 import functools
+import gc
+import multiprocessing
+import os
+import signal
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +15,7 @@ import pytest
 from host_tasks import Counter
 
 from sqt_jax.envs.host import host_environment
+from sqt_jax.envs.host_episodes import PlayingThread
 
 GO, END, CUT = [0.5, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]
 BAD_OBS, BAD_REWARD = [0.1, 0.0, -1.0], [0.1, 0.0, 1.0]
@@ -181,11 +188,47 @@ def test_processes_play_the_same_episodes():
     env.host.close()  # does nothing
 
 
-def test_a_process_that_ends_is_an_error():
+def test_a_process_that_ends_is_an_error_until_the_next_reset():
     env = counter(1, exits_at=2)
     assert bool(env.host.failed(play([GO] * 3, env=env)[-1]))
     assert "a worker process ended by itself (exit codes: [7])" in env.host.error().text
+    assert play([GO], env=env)[-1].reward == 1 and env.host.error() is None
     env.host.close()
+
+
+def test_a_wait_that_ctrl_c_ends_does_not_give_its_result_to_the_next_call():
+    thread, release = PlayingThread(), threading.Event()
+
+    def late():
+        os.kill(os.getpid(), signal.SIGINT)
+        return release.wait(60)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            thread.run(late)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        release.set()
+    assert thread.run(lambda: "next") == "next"
+
+
+def test_an_environment_that_nobody_has_any_more_leaves_no_thread_and_no_process():
+    def used(processes):
+        env = counter(processes)
+        play([GO], env=env)
+
+    def here():
+        gc.collect()
+        return {*threading.enumerate(), *multiprocessing.active_children()}
+
+    before = here()
+    used(0)
+    used(1)
+    deadline = time.monotonic() + 20
+    while here() - before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not here() - before
 
 
 def test_on_an_accelerator_the_call_is_pure_and_plays_the_same(monkeypatch):

@@ -19,15 +19,17 @@ KEYS = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9]], np.uint32)
 ACTIONS = np.array([[0.5, 0, 0], [0, 1, 0], [0, 0, 0]], np.float32)
 
 SCRIPT = """
-import sys, time
+import functools, sys, time
 import numpy as np
 from host_tasks import Counter
 from sqt_jax.envs.host_processes import ProcessRows
 
 if __name__ == "__main__":
-    rows = ProcessRows(Counter, 2, 2, (3, 3))
+    rows = ProcessRows(functools.partial(Counter, seconds=1000), 2, 2, (3, 3))
     rows.start(np.zeros((2, 3), np.uint32))
     print(*[worker.pid for worker in rows.workers.processes], flush=True)
+    if sys.argv[1] == "step":
+        rows.step(np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint32))
     time.sleep(60 if sys.argv[1] == "wait" else 0)
 """
 
@@ -50,17 +52,18 @@ def test_no_more_workers_than_environments():
     rows.close()
 
 
-@pytest.mark.parametrize("end", ["by itself", "SIGKILL"])
+@pytest.mark.parametrize("end", ["by itself", "SIGKILL", pytest.param("in a step", marks=pytest.mark.slow)])
 def test_no_worker_outlives_its_run(tmp_path, end):
     (tmp_path / "script.py").write_text(SCRIPT)
     paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parent.parent)])
-    command = [sys.executable, "script.py", "wait" if end == "SIGKILL" else "end"]
+    command = [sys.executable, "script.py", {"by itself": "end", "SIGKILL": "wait"}.get(end, "step")]
     with subprocess.Popen(
         command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         workers = [int(word) for word in process.stdout.readline().split()]
         assert len(workers) == 2
-        if end == "SIGKILL":
+        if end != "by itself":
+            time.sleep(1.0 if end == "in a step" else 0.0)
             process.kill()
         process.wait(60)
         deadline = time.monotonic() + 20

@@ -58,3 +58,31 @@ def test_close_closes_each_environment():
     rows.close()
     rows.close()
     assert Closing.closed == 3
+
+
+@pytest.mark.parametrize("error", [RuntimeError("in\nuse"), SystemExit(3)])
+def test_an_environment_that_cannot_be_closed_is_a_warning_and_the_others_are_closed(error):
+    class Stuck(Counter):
+        tried = 0
+
+        def close(self):
+            Stuck.tried += 1
+            raise error
+
+    rows = LocalRows(Stuck, 2)
+    rows.start(keys_of(0, 0))
+    with pytest.warns(UserWarning, match="an environment could not be closed: (RuntimeError: in use|SystemExit: 3)"):
+        rows.close()
+    assert Stuck.tried == 2
+
+
+def test_a_reward_that_is_missing_is_an_error_and_not_nan():
+    class Forgetful(Counter):
+        def step(self, action):
+            obs, _, *rest = super().step(action)
+            return obs, None, *rest
+
+    rows = LocalRows(Forgetful, 1)
+    rows.start(keys_of(0))
+    with pytest.raises(ValueError, match="^reward: expects a number, not None$"):
+        rows.step(np.zeros((1, 3), np.float32), keys_of(1))

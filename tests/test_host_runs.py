@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -20,8 +21,10 @@ from host_tasks import Counter
 
 import sqt_jax
 from experiments import play, report, run, tables
+from experiments.commandline import flags
 from sqt_jax.envs.gym_ids import from_gymnasium
 from sqt_jax.experiment import make_trainer
+from sqt_jax.members import Layout
 from sqt_jax.types import Scalars
 
 COUNTER = "gym:host_tasks:Counter-v0"
@@ -39,11 +42,13 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "runs/gym-host_tasks-Counter-v0/td3_sqt"
 
 
-@pytest.mark.filterwarnings("ignore:.*Overriding environment")
-def test_a_run_its_tables_its_report_and_its_film(folder, capsys):
-    assert run_tiny("--name=a", "--env_args=bad_above=0.9") == 0
+@pytest.mark.filterwarnings("ignore:.*Overriding environment", "ignore:an environment could not be closed")
+def test_a_run_its_tables_its_report_and_its_film(folder, tmp_path, capsys):
+    assert run_tiny("--name=a", "--env_args=bad_above=0.9,unruly=true") == 0
+    os.chdir(tmp_path)  # the environment has left it
+    assert " starts of gym:host_tasks:Counter-v0 had an observation" in capsys.readouterr().out
     content = json.loads((folder / "a/config.json").read_text())
-    assert content["settings"]["env"] == COUNTER and content["settings"]["env_args"] == "bad_above=0.9"
+    assert content["settings"]["env"] == COUNTER and content["settings"]["env_args"] == "bad_above=0.9,unruly=true"
     assert content["settings"]["physics"] == content["evaluated_on"] == "gymnasium"
     with (folder / "a/metrics.csv").open() as file:
         last = [*csv.DictReader(file)][-1]
@@ -53,30 +58,48 @@ def test_a_run_its_tables_its_report_and_its_film(folder, capsys):
     assert tables.main(["tables", "runs"]) == 0 and report.main(["report", "runs", "--out=r.html"]) == 0
     assert "host_tasks" not in sys.modules  # a file's names are not imported
     printed, page = capsys.readouterr().out, Path("r.html").read_text()
-    assert COUNTER in printed and COUNTER in page and "bad_above=0.9" in page
+    assert COUNTER in printed and COUNTER in page and "bad_above=0.9,unruly=true" in page
     assert play.main(["play", str(folder / "a")]) == 2
     assert "imports a module" in capsys.readouterr().err and "host_tasks" not in sys.modules
     arguments = ["play", str(folder / "a"), f"--env={COUNTER}", "--episodes=2", "--video=film.gif"]
     assert play.main(arguments) == 0
     printed = capsys.readouterr().out
     assert printed.count("return ") == 2 and "film.gif: 22x16" in printed  # 21x15 pixels, padded
+    assert (tmp_path / "film.gif").exists()
 
 
-def test_an_exception_ends_the_run_with_its_error_and_a_checkpoint_of_the_step_before(folder, capsys):
-    assert run_tiny("--name=a", "--env_args=fails_at=137") == 1
+@pytest.mark.parametrize(("devices", "saved"), [(1, 136), (2, 100)])
+def test_an_exception_ends_the_run_with_its_error_and_a_checkpoint(folder, capsys, devices, saved):
+    """On one device of the step before; on several, members stop at different steps: the last one."""
+    assert run_tiny("--name=a", "--env_args=fails_at=137", f"--devices={devices}") == 1
     printed = capsys.readouterr()
     line = printed.err.splitlines()[-1]
     assert line == (
         f"--env={COUNTER}: RuntimeError: the simulator is gone; traceback: runs/gym-host_tasks-Counter-v0/td3_sqt/a/"
-        "error.txt; the last checkpoint is of step 136"
+        f"error.txt; the last checkpoint is of step {saved}"
     )
-    assert "in step\n" in (folder / "a/error.txt").read_text()
+    assert "in step\n" in (error := (folder / "a/error.txt").read_text()) and "UTF-8: \\udcff" in error
     assert json.loads((folder / "a/summary.json").read_text())["status"] == "interrupted"
-    # 136 more steps, of new environments, until the next exception.
+    # New environments have 136 steps more until the next exception.
     assert run.main(["run", f"--resume={folder / 'a'}"]) == 2
     assert "imports the module host_tasks" in capsys.readouterr().err
     assert run.main(["run", f"--resume={folder / 'a'}", f"--env={COUNTER}"]) == 0
-    assert "new episodes begin" in capsys.readouterr().out
+    assert "new episodes begin" in capsys.readouterr().out and not (folder / "a/error.txt").exists()
+
+
+def test_a_resumed_run_on_a_function_keeps_its_arguments_and_processes(monkeypatch):
+    content = {
+        "settings": {"env_args": "seconds=0.5", "max_episode_steps": 7},
+        "output": {"env_processes": 3},
+    }
+    monkeypatch.setattr(run.run_config, "read", lambda path: SimpleNamespace(content=content))
+    monkeypatch.setattr(run.factories, "make_from", lambda *arguments: arguments)
+
+    def made(*more):
+        return run.own_environment(flags.parse(["run", "--resume=x", "--env=host_tasks:counter", *more]))
+
+    assert made() == ("host_tasks:counter", {"seconds": 0.5}, 7, 3)
+    assert made("--env_processes=0") == ("host_tasks:counter", {"seconds": 0.5}, 7, 0)
 
 
 @pytest.mark.slow
@@ -98,7 +121,7 @@ def test_processes_change_no_result(folder, capsys):
         (["--env=gym:host_tasks:Endless-v0"], "--env=gym:host_tasks:Endless-v0: has no time limit"),
         (["--env_args=wings=2"], "--env=gym:host_tasks:Counter-v0: TypeError: "),
         (["--env_args=wings"], "--env_args: expects NAME=VALUE,... as in continuous=true,gravity=-9.8, not 'wings'"),
-        (["--devices=2"], "--devices=2: expects 1 with an environment on the host"),
+        (["--devices=2", "--env_processes=1"], "--devices=2: expects 1 with --env_processes"),
         (["--physics=mjx"], "--physics: expects one of gymnasium, not 'mjx'"),
         (["--env=ant", "--env_args=a=1"], "--env_args: has no effect with ant"),
         (["--env=ant", "--max_episode_steps=9"], "--max_episode_steps: has no effect with ant"),
@@ -142,6 +165,24 @@ def test_nothing_of_or_after_a_failed_step_is_learned_or_stored():
     for name in ("agent", "replay", "episodes", "means"):
         for a, b in zip(jax.tree.leaves(getattr(state, name)), jax.tree.leaves(getattr(before, name)), strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+def test_devices_play_their_own_episodes_and_stop_when_one_of_them_fails():
+    fails_at = [0, 8]  # of the environments that play; others are made to read their spaces
+
+    def make():
+        return Counter(fails_at=fails_at.pop() if playing else 0)
+
+    config = sqt_jax.make_config("td3_sqt", "gym:Pendulum-v1", steps=5000, warmup_steps=4, batch_size=4, hidden=(4,))
+    playing = False
+    env = from_gymnasium("counter", make, 5)
+    playing = True
+    sweep = sqt_jax.make_sweep(make_trainer(config, env), Layout(2, tuple(jax.devices()[:2])))
+    scalars = Scalars(*(jnp.full(2, value) for value in config.agent.scalars()))
+    state = sweep.init(jax.vmap(jax.random.key)(jnp.arange(2)), scalars)
+    steps = [int(shard.data) for shard in sweep.advance(state, 5000, False).env_steps.addressable_shards]
+    assert 7 in steps and max(steps) < 5000
+    assert env.host.error().text == "RuntimeError: the simulator is gone"
 
 
 def test_one_program_without_a_copy_of_the_replay():

@@ -41,10 +41,10 @@ LAYERS = [
         "experiments.running.session",
     },
     {"experiments.run"},
-    {"experiments.endurance"},  # starts runs by their command
+    {"experiments.endurance", "experiments.tuning"},  # start runs by their command
     {
         f"experiments.{command}"
-        for command in ("sweep", "tables", "plots", "play", "tabular", "bench", "soak", "killtest")
+        for command in ("sweep", "tune", "tables", "plots", "play", "tabular", "bench", "soak", "killtest")
     },
     {"experiments.report", "experiments.parity"},  # use parts of other commands
 ]
@@ -62,6 +62,7 @@ PACKAGES = (
     "experiments.launchers",
     "experiments.grids",
     "experiments.endurance",
+    "experiments.tuning",
 )
 # Modules on another layer than the rest of their package.
 OWN_LAYER = {

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import pytest
 
 import sqt_jax
 from experiments import play, plots, report, run, tables
+from experiments.running import session
 
 ARGV = ["run", "--algo=td3_sqt", "--seeds=0,1", "--steps=40", "--warmup_steps=20", "--eval_every=20", "--quiet"]
 ARGV += ["--hidden=16,16", "--batch_size=16", "--eval_episodes=1", "--checkpoint_every=20", "--notensorboard"]
@@ -115,6 +117,23 @@ def test_training_functions_need_the_environment_of_their_configuration():
         with pytest.raises(ValueError, match="an environment of your own called point, given: maze"):
             make(config, make_point("maze"))
         assert make(config, env)
+
+
+def test_a_module_that_changes_jaxs_switches_does_not_change_those_of_the_run(tmp_path, monkeypatch):
+    (tmp_path / "switches_of_a_test.py").write_text(f'{MODULE}\njax.config.update("jax_enable_x64", True)\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    seen = []
+
+    def start_session(plan, argv):
+        seen.append(jax.config.values["jax_enable_x64"])
+        return SimpleNamespace(run=lambda: 0)
+
+    monkeypatch.setattr(session, "start_session", start_session)
+    try:
+        assert run.main([*ARGV, "--env=switches_of_a_test:make", f"--out={tmp_path}"]) == 0
+    finally:
+        jax.config.update("jax_enable_x64", False)
+    assert seen == [False]
 
 
 @pytest.mark.slow

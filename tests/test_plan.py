@@ -69,6 +69,50 @@ def test_resume_without_a_name_distinguishes_sweeps(tmp_path, sweep):
         plan(tmp_path, "--resume", sweep, "--seeds=9")
 
 
+PAIRED = ("--paired", "--lr=1e-3,1e-3,1e-4", "--penalty_coef=0.1,0.5,0.5")
+
+
+def test_paired_lists_make_a_member_per_pair_and_seed(tmp_path):
+    made = plan(tmp_path, *PAIRED)
+    assert [(member.seed, member.config.agent.lr, member.config.agent.penalty_coef) for member in made.members] == [
+        (seed, *pair) for pair in ((1e-3, 0.1), (1e-3, 0.5), (1e-4, 0.5)) for seed in (3, 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("lists", "differing"),
+    [
+        (PAIRED, ""),
+        (("--paired", "--lr=1e-3,1e-4,1e-3", "--penalty_coef=0.1,0.5,0.5"), "lr"),
+        (("--paired", "--lr=1e-3,1e-3,1e-4", "--penalty_coef=0.5,0.1,0.5"), "penalty_coef"),
+        (("--lr=1e-3,1e-4", "--penalty_coef=0.1,0.5"), "penalty_coef"),
+    ],
+    ids=["the same", "other pairs", "another order", "their product"],
+)
+def test_a_paired_run_is_resumed_with_its_own_pairs_only(tmp_path, lists, differing):
+    path = begun(tmp_path, "a", *PAIRED)
+    for arguments, new in ((["--resume", "--name=a"], NEW), ([f"--resume={path}"], "")):
+        if not differing:
+            members = plan(tmp_path, *arguments, *lists, new=new).members
+            assert [m.config.agent.lr for m in members] == [1e-3] * 4 + [1e-4] * 2
+            assert [m.config.agent.penalty_coef for m in members] == [0.1] * 2 + [0.5] * 4
+        else:
+            with pytest.raises(flags.UsageError, match=f"these differ: .*{differing}"):
+                plan(tmp_path, *arguments, *lists, new=new)
+
+
+def test_pairs_that_are_a_product_resume_as_one(tmp_path):
+    path = begun(tmp_path, "a", "--paired", "--lr=1e-3,1e-4,1e-3,1e-4", "--tau=0.1,0.1,0.2,0.2")
+    product = begun(tmp_path, "b", "--lr=1e-3,1e-4", "--tau=0.1,0.2")
+    for pairs in (
+        ["--paired", "--lr=1e-3,1e-3,1e-4,1e-4", "--tau=0.1,0.2,0.1,0.2"],
+        ["--lr=1e-3,1e-4", "--tau=0.1,0.2"],
+    ):
+        assert plan(tmp_path, f"--resume={product}", *pairs, new="").resumed
+        with pytest.raises(flags.UsageError, match="these differ: .*paired .its own: True, now: False."):
+            plan(tmp_path, f"--resume={path}", *pairs, new="")
+
+
 def test_with_a_name_resume_finds_that_run(tmp_path):
     path = begun(tmp_path, "a")
     begun(tmp_path, "b", started="2026-01-01T00:00:00+00:00")
@@ -115,7 +159,8 @@ def test_a_folder_needs_no_other_flags(tmp_path):
     assert again.members == made.members
 
 
-DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
+DEFAULTS = {"checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
+DEFAULTS |= {"tensorboard": True, "wandb": "", "tuned": ""}
 
 
 @pytest.mark.parametrize(
@@ -130,6 +175,10 @@ DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints":
         ({"devices": 99}, ["--devices=1"], {"devices": 1}),
         ({"devices": 0}, [], {}),
         ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
+        ({"wandb": "ants"}, [], {"wandb": "ants"}),
+        ({"wandb": "ants"}, ["--wandb=bees"], {"wandb": "bees"}),
+        ({"wandb": "ants"}, ["--nowandb"], {"wandb": ""}),
+        ({"wandb": True}, [], {}),
         # Values that no command line could have given are ignored.
         ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
         ({"checkpoint_every": "often", "keep_checkpoints": True, "tensorboard": None, "more": 1}, [], {}),

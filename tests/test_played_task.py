@@ -18,6 +18,11 @@ def test_a_task_is_played_on_mujoco_by_default():
     assert make_played_task(HOPPER, "mjx", "track").physics == "mjx"
 
 
+def test_an_environment_with_jax_that_was_trained_in_processes_is_played():
+    task = make_played_task(make_config("td3", "gym:phys2d/Pendulum-v0"), None, "")
+    assert task.env.episode_length == 200 and task.env.host
+
+
 @pytest.mark.parametrize(
     ("asked", "camera", "says"),
     [

@@ -69,6 +69,7 @@ PYTHON = programs()
 SHELL = [argv for page in PAGES for argv in commands("\n".join(code for kind, _, code in BLOCKS[page] if kind == "sh"))]
 RUNS = [argv for argv in SHELL if argv[0] == "run"]
 SWEEPS = [argv for argv in SHELL if argv[0] == "sweep"]
+TUNES = [argv for argv in SHELL if argv[0] == "tune"]
 LOOKS = [argv for argv in SHELL if argv[0] in ("tables", "plots", "report", "play")]
 BENCHES = [argv for argv in SHELL if argv[0] == "bench"]
 OTHERS = [argv for argv in SHELL if argv[0] in ("tabular", "parity", "soak", "killtest")]
@@ -153,9 +154,19 @@ def test_commands_that_train_grids_are_valid(argv):
     command = [sys.executable, "-m", "experiments.sweep", *argv[1:], "--tasks=nowhere"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith("--tasks: "), done.stderr
-    own = re.findall(r'(?:DEFINE_\w+|define_path)\("(\w+)"', (ROOT / "experiments/sweep.py").read_text())
+    text = "".join((ROOT / "experiments" / name).read_text() for name in ("sweep.py", "launchers/launcher_flags.py"))
+    own = re.findall(r'(?:DEFINE_\w+|define_path)\("(\w+)"', text)
     rest = [word for word in argv[1:] if word.removeprefix("--").partition("=")[0] not in own]
     assert flags.parse(["run", "--algo=td3", "--env=ant", *rest])
+
+
+@pytest.mark.parametrize("argv", TUNES, ids=ids)
+def test_commands_that_tune_are_valid(argv):
+    """The command's own flags, then those of every run; the last word makes it refuse to start."""
+    pytest.importorskip("optuna", reason="needs the extra tune")
+    command = [sys.executable, "-m", "experiments.tune", *argv[1:], "--launcher=none"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("--launcher: "), done.stderr
 
 
 @pytest.mark.parametrize("argv", LOOKS, ids=ids)
@@ -214,7 +225,7 @@ def test_flags_of_other_commands_exist(argv):
 
 
 def test_every_command_shown_is_checked():
-    assert len(RUNS + SWEEPS + LOOKS + BENCHES + OTHERS) == len(SHELL)
+    assert len(RUNS + SWEEPS + TUNES + LOOKS + BENCHES + OTHERS) == len(SHELL)
     assert len(PYTHON) >= 5 and len(RUNS) >= 15 and len(LOOKS) >= 10 and len(BENCHES) >= 5 and len(OTHERS) >= 5
 
 

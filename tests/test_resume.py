@@ -120,20 +120,20 @@ def test_the_same_command_with_resume_starts_the_run_and_resumes_it(tmp_path, mo
     assert differences(read_results(path_in(unbroken)), read_results(path_in(tmp_path / "new"))) == []
 
 
+def content(folder):
+    """The files below a folder, without locks: they say which process was the last."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"}
+
+
 def test_a_finished_run_does_not_change(tmp_path, unbroken):
     assert run(tmp_path, *MEMBERS) == 0
-
-    def content():
-        files = (path for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock")
-        return {path: path.read_bytes() for path in files}
-
-    before = content()
+    before = content(tmp_path)
     assert resumed(tmp_path) == 0
-    assert content() == before
+    assert content(tmp_path) == before
     for name in ("policy", "policy_best"):
         shutil.rmtree(path_in(tmp_path) / name)  # as after a full disk
         assert resumed(tmp_path) == 0
-        assert content().keys() >= before.keys()
+        assert content(tmp_path).keys() >= before.keys()
 
 
 def test_a_finished_run_is_resumed_for_more_steps(tmp_path):
@@ -168,11 +168,11 @@ def test_a_diverged_member_stays_diverged(tmp_path, capsys):
 def test_a_run_without_checkpoints_is_rejected_and_not_changed(tmp_path, capsys):
     assert run(tmp_path, "--checkpoint_every=0") == 0
     assert not (path_in(tmp_path) / "checkpoint").exists()
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    before = content(tmp_path)
     capsys.readouterr()
     assert resumed(tmp_path, "--checkpoint_every=20") == 2
     assert "expects a run with checkpoints to resume from; it has none" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert content(tmp_path) == before
 
 
 @pytest.mark.parametrize(("reached", "rejected"), [(0, False), (50, False), (100, False), (150, True)])

@@ -66,8 +66,23 @@ def test_settings_of_a_run_have_the_swept_values_as_tuples():
     members, swept = members_of(seeds=(3, 1), sweep={"lr": (0.1, 0.2), "tau": (0.5, 0.25)})
     settings = run_config.all_settings(members, swept)
     assert (settings["seeds"], settings["lr"], settings["tau"]) == ((3, 1), (0.1, 0.2), (0.5, 0.25))
-    assert settings.keys() == members[0].config.flat().keys() | {"seeds"}
+    assert settings.keys() == members[0].config.flat().keys() | {"seeds", "paired"}
+    assert not settings["paired"]
     assert (settings["steps"], settings["hidden"], settings["gamma"]) == (60, (8, 4), 0.99)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "lists"),
+    [
+        ([(1, 2), (1, 3), (4, 2), (4, 3)], {"lr": (1, 4), "tau": (2, 3), "paired": False}),
+        ([(1, 2), (4, 3)], {"lr": (1, 4), "tau": (2, 3), "paired": True}),
+        ([(1, 2), (1, 2), (4, 3), (1, 3)], {"lr": (1, 4, 1), "tau": (2, 3, 3), "paired": True}),
+        ([(1, 3), (1, 2), (4, 2), (4, 3)], {"lr": (1, 1, 4, 4), "tau": (3, 2, 2, 3), "paired": True}),
+    ],
+    ids=["a product", "pairs", "a repetition", "all pairs in another order"],
+)
+def test_lists_that_are_no_product_have_a_value_per_configuration(pairs, lists):
+    assert run_config.swept_lists(["lr", "tau"], pairs) == lists
 
 
 def test_every_process_that_resumed_a_run_is_recorded(tmp_path):

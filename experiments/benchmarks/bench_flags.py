@@ -42,10 +42,14 @@ flags.DEFINE_enum(
 )
 flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay and growth use only the first one.")
 flags.DEFINE_list(
-    "physics", None, "Physics of the suites env, loop and memory. Default: every physics that can run on this machine."
+    "physics",
+    None,
+    "Physics of the suites env, loop, memory and batches. Default: every physics that can run on this machine.",
 )
 flags.DEFINE_list("solver", [], "More limits of MJX's solver for the suite physics: iterations/line-search steps.")
-flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop, checkpoint and memory.")
+flags.DEFINE_list(
+    "algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop, checkpoint, memory and batches."
+)
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list(
     "devices", ["auto"], "Numbers of devices for the members of the suites update and loop; auto: as in a run."

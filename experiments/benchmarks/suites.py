@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from experiments.benchmarks import compare, growth
+from experiments.benchmarks.measure_batches import bench_batches
 from experiments.benchmarks.measure_checkpoints import bench_checkpoint
 from experiments.benchmarks.measure_envs import bench_env, bench_physics
 from experiments.benchmarks.measure_loops import bench_loops
@@ -14,7 +15,7 @@ from experiments.benchmarks.measure_updates import bench_updates
 from experiments.benchmarks.measurements import Failure, Measurement, error_line
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # measured by default
-MORE_SUITES = ("growth", "memory")
+MORE_SUITES = ("growth", "memory", "batches")
 
 
 class Request(NamedTuple):
@@ -70,6 +71,9 @@ def _suites(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
         elif suite == "memory":
             for algo, task, name, capacity in itertools.product(algos, tasks, physics, capacities):
                 yield f"memory: {algo} on {task}, {name}", bench_memory(algo, task, members, capacity, name)
+        elif suite == "batches":
+            for algo, task, name in itertools.product(algos, tasks, physics):
+                yield f"batches: {algo} on {task}, {name}", bench_batches(algo, task, members, name)
         elif suite == "checkpoint":
             for algo, task in itertools.product(algos, tasks):
                 yield f"checkpoint: {algo}, {task}", bench_checkpoint(algo, task, members, timing["repeats"])

@@ -37,6 +37,17 @@ class OutputConfig:
         high=1000,
     )
     tensorboard: bool = setting(True, "also write TensorBoard events")
+    wandb: str = setting(
+        "",
+        "also send the rows to this project of Weights & Biases, a run per member; without a name: WANDB_PROJECT or "
+        "sqt_jax; --nowandb turns it off",
+        default_text="off",
+    )
+    tuned: str = setting(
+        "",
+        "how the settings were tuned, for a footnote in tables: experiments.tune sets it",
+        default_text="they were not",
+    )
 
 
 class Flag(NamedTuple):
@@ -182,6 +193,14 @@ def _flags() -> dict[str, list[Flag]]:
                 metavar="N,N...",
             ),
             Flag(
+                name="paired",
+                parse=None,
+                expects="true or false",
+                help="pair the lists of swept settings: the first values of all lists, the second values, and so on, "
+                "instead of every combination",
+                default="false",
+            ),
+            Flag(
                 name="preset",
                 parse=str,
                 expects=f"one of {', '.join(PRESETS)}",
@@ -254,7 +273,7 @@ def help_text() -> str:
         "",
         "In brackets: the default. A switch is turned off by --noNAME.",
         f"A setting that may be swept ({swept}) may be a list:",
-        "the members of the run are all its values times the seeds.",
+        "the members of the run are all combinations of their values (--paired: the pairs) times the seeds.",
         "Exit codes: 0 done, 1 the results could not be written, 2 bad usage, 3 a member diverged, 130 interrupted.",
     ]
     return "\n".join(lines)

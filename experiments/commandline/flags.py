@@ -4,10 +4,11 @@ A flag that is not given is absent from the result: defaults belong to the algor
 separately; `sqt_jax.make_config` checks them together.
 """
 
+import itertools
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ class Options(NamedTuple):
     seeds: tuple[int, ...] | None
     settings: dict[str, Any]  # one value for all members
     sweep: dict[str, tuple[float, ...]]  # swept settings with several values, in the order of `config.SETTINGS`
+    paired: bool  # the lists of `sweep` are equally long, and their i-th values belong together
     preset: str
     out: str
     name: str | None
@@ -48,7 +50,15 @@ class Options(NamedTuple):
     devices: int | None
     env_processes: int | None
     tensorboard: bool | None
+    wandb: str | None  # a project; empty: none
+    tuned: str | None
     quiet: bool
+
+    @property
+    def configurations(self) -> list[tuple[float, ...]]:
+        """The values of the settings in `sweep`, a tuple per configuration, in the order of the run's members."""
+        lists = self.sweep.values()
+        return list(zip(*lists, strict=True) if self.paired and lists else itertools.product(*lists))
 
 
 class _Parser(absl_flags.ArgumentParser):
@@ -98,18 +108,25 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_values(argv: Sequence[str]) -> list[str]:
-    """The words with a value for `--resume` and `--env_processes` where none follows."""
-    values = {"resume": LATEST, "env_processes": str(usable_cores())}
+    """The words with a value for `--resume`, `--env_processes` and `--wandb` where none follows.
+
+    A value of `--wandb` may also be true or false, as in a YAML file.
+    """
+    project = os.environ.get("WANDB_PROJECT") or "sqt_jax"
+    values = {"resume": LATEST, "env_processes": str(usable_cores()), "wandb": project}
+    switched = {"--nowandb": "--wandb=", "--wandb=false": "--wandb=", "--wandb=true": f"--wandb={project}"}
     following = [*argv[1:], "-"]
     return [
-        f"{word}={values[name]}" if (name := word.lstrip("-")) in values and word != name and after[:1] == "-" else word
+        f"{word}={values[name]}"
+        if (name := word.lstrip("-")) in values and word != name and after[:1] == "-"
+        else switched.get(word, word)
         for word, after in zip(argv, following, strict=True)
     ]
 
 
 def _file_values(name: str) -> dict[str, Any]:
     """The flags of a YAML file, parsed as those of a command line."""
-    switches = {flag.name for group in FLAGS.values() for flag in group if flag.parse is None}
+    switches = {flag.name for group in FLAGS.values() for flag in group if flag.parse is None} | {"wandb"}
     try:
         arguments = config_file.arguments(Path(paths.expanded(name)), switches)
     except (config_file.InvalidConfigFile, ValueError) as error:
@@ -152,6 +169,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
     for name, about in settings_of(OutputConfig).items():
         if output[name] is not None:
             _check(about, output[name])
+    _check_project(output["wandb"] or "")
 
     preset = own["preset"] or "paper"
     if preset not in PRESETS:
@@ -174,7 +192,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
 
     settings: dict[str, Any] = {}
     sweep: dict[str, tuple[float, ...]] = {}
-    quiet = values.pop("quiet", False)
+    quiet, paired = values.pop("quiet", False), values.pop("paired", False)
     for setting, value in values.items():
         about = SETTINGS[setting]
         if about.auto and value == "auto":
@@ -183,13 +201,17 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
         choices = value if about.swept else (value,)
         for choice in choices:
             _check(about, choice)
-        _reject_duplicates(setting, choices)
+        if not paired:
+            _reject_duplicates(setting, choices)
         if len(choices) > 1:
             sweep[setting] = choices
         else:
             settings[setting] = choices[0]
     sweep = {name: sweep[name] for name in SETTINGS if name in sweep}
-    count = math.prod(map(len, sweep.values())) * len(own["seeds"] or DEFAULT_SEEDS)
+    if paired:
+        _check_pairs(sweep)
+    lengths = [len(choices) for choices in sweep.values()]
+    count = (max(lengths, default=1) if paired else math.prod(lengths)) * len(own["seeds"] or DEFAULT_SEEDS)
     if count > MAX_MEMBERS:
         raise UsageError(f"--seeds: expects at most {MAX_MEMBERS} members, seeds times swept values, not {count}")
     return Options(
@@ -198,6 +220,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
         seeds=_check_seeds(own["seeds"]) if own["seeds"] is not None else None if folder_given else DEFAULT_SEEDS,
         settings=settings,
         sweep=sweep,
+        paired=paired,
         preset=preset,
         out=out,
         name=name,
@@ -215,12 +238,30 @@ def _check(about: Setting, value: Any) -> None:
         raise UsageError(str(error)) from None
 
 
+def _check_pairs(sweep: Mapping[str, Sequence[float]]) -> None:
+    """Raises `UsageError` unless the lists are equally long and no configuration comes twice."""
+    lengths = {name: len(choices) for name, choices in sweep.items()}
+    if len(set(lengths.values())) > 1:
+        found = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        raise UsageError(f"--paired: expects lists of one length; {found}")
+    pairs = list(zip(*sweep.values(), strict=True))
+    for values in pairs if len(set(pairs)) < len(pairs) else ():
+        if pairs.count(values) > 1:
+            words = " ".join(f"--{name}={value}" for name, value in zip(sweep, values, strict=True))
+            raise UsageError(f"--paired: expects each configuration once, got {words} {pairs.count(values)} times")
+
+
 def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
             raise UsageError(f"--seeds={seed}: expects whole numbers from 0 to {MAX_SEED}")
     _reject_duplicates("seeds", seeds)
     return seeds
+
+
+def _check_project(name: str) -> None:
+    if len(name) > 128 or set(name) & set("/\\#?%:") or not name.isprintable():
+        raise UsageError(f"--wandb={name[:40]}: expects the name of a project, up to 128 characters without /\\#?%:")
 
 
 def _folder(flag: str, text: str) -> str:

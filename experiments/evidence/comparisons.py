@@ -156,7 +156,7 @@ def _compared(
             continue
         found = _against(x, y)
         why += _percentage_notes(found)
-        marks = notes(*why)
+        marks = notes(*why, *(f"{one.algo} on {task}: {text}" for one in (group, other) for text in one.tuned))
         all_marks |= set(marks)
         strata += [x, y]
         cells.append(Cell(_against_lines(found), marks))

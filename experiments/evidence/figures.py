@@ -31,6 +31,7 @@ from experiments.evidence.penalty_figure import penalty_sweep
 from experiments.evidence.pooling import Collected
 
 BAND_RESAMPLES = 1000
+MAX_LABELS = 20  # of a run's curves; a batch of a tuning has many configurations
 LABELS = {
     "return_mean": "return of an evaluation episode",
     "q_std": "std over critics, Q(s, a)",
@@ -72,7 +73,8 @@ def draw_curves(table: Mapping[str, np.ndarray], path: Path, title: str) -> None
         style_axes(axes)
     left.set_ylabel(LABELS["return_mean"])
     right.set_ylabel(LABELS["q_std"])
-    left.legend(frameon=False, fontsize="small", loc="best")
+    if len(found) <= MAX_LABELS:
+        left.legend(frameon=False, fontsize="small", loc="best")
     heading = f"{title}: mean and std (ddof 0) over seeds, thin lines: the seeds"
     figure.suptitle(heading, fontsize="medium")
     figure.savefig(path)

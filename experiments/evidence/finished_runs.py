@@ -3,7 +3,7 @@
 import csv
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +12,9 @@ import numpy as np
 from experiments.commandline.arguments import UsageError, printable
 from experiments.evidence import run_settings
 
+MAX_TUNED = 300  # characters of `tuned`
+# What a tuning leaves: `experiments.tuning` has these names.
+STUDY_FILE, TRIALS = "study.log", "trials"
 REQUIRED = ("member", "env_steps", "gradient_steps", "seed", "return_mean", "q_std")
 
 
@@ -24,6 +27,7 @@ class MemberCurves(NamedTuple):
     versions: dict[str, str]  # of the packages
     columns: dict[str, np.ndarray]  # [evaluations] each, in the order of the env steps
     own_sizes: tuple[int, int] | None = None  # (observation, action) of an environment handed in from Python
+    tuned: str = ""  # how its settings were tuned; empty: they were not
 
 
 def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
@@ -40,7 +44,7 @@ def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
             if not path.is_dir():
                 problem = "is not a folder" if path.exists() else "does not exist"
                 raise UsageError(f"{text}: {problem}; RUNS expects folders of runs or folders above them")
-            below, without = _below(path)
+            below, without, tuning = _below(path)
         except (OSError, ValueError) as error:
             if isinstance(error, UsageError):
                 raise
@@ -50,24 +54,31 @@ def find(paths: Sequence[str]) -> tuple[list[Path], list[str]]:
         for run in below:
             found.setdefault(run.resolve(), run)
         notes += [f"left out: {folder} has an evaluations.csv but no config.json" for folder in without]
+        notes += [f"left out: {folder}, the trials of a tuning; given as one of RUNS it is shown" for folder in tuning]
     return list(found.values()), notes
 
 
-def _below(path: Path) -> tuple[list[Path], list[Path]]:
-    """Folders with a config.json, and those with an evaluations.csv only."""
+def _below(path: Path) -> tuple[list[Path], list[Path], list[Path]]:
+    """Folders with a config.json, those with an evaluations.csv only, and those with trials of a tuning, not searched.
+
+    The best of many trials is no result: the winner is trained again on other seeds.
+    """
 
     def fail(error: OSError) -> None:
         raise error
 
-    runs, without = [], []
+    runs, without, tuning = [], [], []
     for parent, folders, names in os.walk(path, onerror=fail):
         folders.sort()
+        if STUDY_FILE in names and TRIALS in folders:
+            folders.remove(TRIALS)
+            tuning.append(Path(parent) / TRIALS)
         if "config.json" in names:
             folders.clear()  # the run's own folders, checkpoints for example
             runs.append(Path(parent))
         elif "evaluations.csv" in names:
             without.append(Path(parent))
-    return runs, without
+    return runs, without, tuning
 
 
 def read_run(path: Path) -> list[MemberCurves]:
@@ -111,11 +122,26 @@ def read_run(path: Path) -> list[MemberCurves]:
         critics = [name for name in ("q_mean", "q_std", "value_bias") if name in own]
         own |= {name: np.where(diverged, np.nan, own[name]) for name in critics}
         found.append(
-            MemberCurves(run=path, seed=seed, settings=settings, versions=versions, columns=own, own_sizes=own_sizes)
+            MemberCurves(
+                run=path,
+                seed=seed,
+                settings=settings,
+                versions=versions,
+                columns=own,
+                own_sizes=own_sizes,
+                tuned=tuned_text(run.content),
+            )
         )
     if not set(columns["member"]) <= set(range(len(run.members))):
         raise UsageError(f"{path}: its evaluations.csv is damaged: it has members that config.json does not have")
     return found
+
+
+def tuned_text(content: Mapping[str, Any]) -> str:
+    """How the settings of a run were tuned, from its config.json; empty: they were not."""
+    output = content.get("output")
+    text = output.get("tuned") if isinstance(output, dict) else None
+    return printable(text)[:MAX_TUNED] if isinstance(text, str) else ""
 
 
 def _read_table(path: Path) -> dict[str, np.ndarray]:

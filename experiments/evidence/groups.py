@@ -51,6 +51,12 @@ class Group:
     def seeds(self) -> tuple[int, ...]:
         return tuple(member.seed for member in self.members)
 
+    @property
+    def tuned(self) -> tuple[str, ...]:
+        """How the settings were tuned, as a footnote; empty if they were not."""
+        texts = dict.fromkeys(member.tuned for member in self.members if member.tuned)
+        return tuple(f"settings tuned on other seeds: {text}" for text in texts)
+
     @cached_property
     def env_steps(self) -> np.ndarray:
         """[evaluations], the env steps at which every seed has an evaluation."""

@@ -181,7 +181,7 @@ def _algorithms(
                 why = [*group.notes, *why]
                 if len(group.seeds) < most:
                     why.append(f"fewer seeds than other cells, which have {most}")
-                cells.append(Cell(text, notes(*why)))
+                cells.append(Cell(text, notes(*why, *group.tuned)))
                 records.append(_record(row, group, quantity, numbers, why))
             penalised = [g for g in row.groups.values() if g.settings["penalty"] != "none"]
             coefs = dict.fromkeys(group.settings["penalty_coef"] for group in penalised)
@@ -277,7 +277,14 @@ def _record(
 ) -> dict[str, Any]:
     settings = {name: group.settings[name] for name in ("penalty_coef", *PROTOCOL)}
     where = {"algo": row.algo, "row": row.label, "env": group.env, "quantity": quantity}
-    return where | dict(numbers) | {"seeds": joined(group.seeds)} | settings | {"source": "", "notes": "; ".join(why)}
+    return (
+        where
+        | dict(numbers)
+        | {"seeds": joined(group.seeds)}
+        | settings
+        | {"source": "", "notes": "; ".join(why)}
+        | ({"tuned": "; ".join(group.tuned)} if group.tuned else {})
+    )
 
 
 def _row_notes(row: AlgorithmRow) -> list[str]:

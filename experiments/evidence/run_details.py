@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.evidence import run_settings
+from experiments.evidence import finished_runs, run_settings
 from experiments.evidence.cells import NOTHING, number
 from experiments.evidence.finished_runs import MemberCurves
 from experiments.evidence.groups import OWN_PHYSICS, Group, setting_text
@@ -133,11 +133,13 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     words = [str(device[key]) for key in ("platform", "kind") if device.get(key)]
     cpus = [f"{device['cpus']} CPUs"] if device.get("cpus") else []
     commit = str(content.get("commit") or NOT_RECORDED)
+    tuned = finished_runs.tuned_text(content)
     return {
         "began": str(content.get("started") or NOT_RECORDED),
         "evaluated on": str(content.get("evaluated_on") or NOT_RECORDED),
         **({"environment": content["env_version"]} if "env_version" in content else {}),
         "preset": str(content["preset"]),
+        **({"settings tuned on other seeds": tuned} if tuned else {}),
         "device": ", ".join([*dict.fromkeys(words), *cpus]) or NOT_RECORDED,
         "commit": commit.replace("+changes", ", with uncommitted changes"),
     }

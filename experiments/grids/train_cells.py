@@ -24,6 +24,7 @@ def train_cells(
     retries: int = 0,
     fail_fast: bool = False,
     signals: Callable[[], int] = lambda: 0,
+    on_end: Callable[[Ended], None] | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> int:
     """Trains the cells that are not finished. One that fails does not stop the others.
@@ -34,12 +35,14 @@ def train_cells(
       retries: how often a cell is started again that was killed or whose machine was lost.
       fail_fast: the first cell that fails stops all others, after they have saved.
       signals: how many signals have asked to stop: the first lets runs save, a second ends them at once.
+      on_end: called with each cell that has ended, instead of lines with its scores.
 
     Returns:
       The worst exit code of the cells, the first of `WORST_FIRST`.
     """
     todo = [cell for cell in cells if needs_training(cell)]
-    say(f"{len(cells)} runs, {len(cells) - len(todo)} of them finished")
+    if on_end is None:
+        say(f"{len(cells)} runs, {len(cells) - len(todo)} of them finished")
     began = said = clock()
     over: list[Ended] = []
     starts = dict.fromkeys(todo, 1)
@@ -61,6 +64,9 @@ def train_cells(
                     launcher.submit([cell])
                     continue
                 over.append(ended)
+                if on_end:
+                    on_end(ended)
+                    continue
                 left = (clock() - began) / len(over) * (len(todo) - len(over))
                 say(f"{len(over)}/{len(todo)} {cell.label}: {_result(ended)}; {format_seconds(left)} left")
             if clock() - said > PROGRESS_SECONDS:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.commandline.arguments import UsageError
-from experiments.launchers import local, slurm
+from experiments.launchers import local, ray_cluster, slurm
 from experiments.launchers.launcher import Launcher
 from sqt_jax.suggestions import expects_one_of
 
@@ -16,10 +16,11 @@ class LauncherOptions(NamedTuple):
     launcher: str
     out: Path
     workers: int | None = None  # local
-    max_jobs: int | None = None  # slurm, as all below
-    slurm: str | None = None
-    slurm_setup: str | None = None
-    detach: bool | None = None
+    max_jobs: int | None = None  # slurm
+    slurm: str | None = None  # slurm
+    slurm_setup: str | None = None  # slurm
+    detach: bool | None = None  # slurm
+    ray: str | None = None  # ray
 
 
 class Kind(NamedTuple):
@@ -35,6 +36,7 @@ LAUNCHERS = {
         lambda options: slurm.make(options.out, options.max_jobs, options.slurm, options.slurm_setup),
         ("max_jobs", "slurm", "slurm_setup", "detach"),
     ),
+    "ray": Kind(lambda options: ray_cluster.make(options.ray or "", options.out), ("ray",)),
 }
 
 

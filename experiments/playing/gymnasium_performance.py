@@ -11,6 +11,7 @@ from experiments.playing import episodes, films, gymnasium_episodes
 from experiments.playing.episodes import PlayedEpisode
 from experiments.playing.film_formats import format_of
 from experiments.running import progress
+from sqt_jax.envs import host_rows
 from sqt_jax.one_line import one_line
 from sqt_jax.rollout import Policy
 from sqt_jax.types import Environment
@@ -37,7 +38,7 @@ def perform(env: Environment, policy: Policy, options: argparse.Namespace, capti
                 film = "--video=FILE writes a film"
                 for _ in states:
                     pass
-        own.close()
+        host_rows.close(own)
     except UsageError:
         raise
     except Exception as error:  # of any type: it is the user's code
@@ -65,7 +66,7 @@ def all_states(
 
 def write_film(own: object, states: Iterator[int], options: argparse.Namespace, caption: str) -> str:
     """Writes the film of the states while they are played, in real time; returns a line about it."""
-    path = options.video
+    path = options.video.absolute()  # the environment may change the current folder
     seconds = gymnasium_episodes.period(own)
     every = films.stride(seconds, format_of(path))
     size: list[tuple[int, ...]] = []
@@ -81,9 +82,11 @@ def write_film(own: object, states: Iterator[int], options: argparse.Namespace, 
         path.parent.mkdir(parents=True, exist_ok=True)
         written = films.write(path, pictures(), every * seconds, caption)
     except OSError as error:
-        raise UsageError(f"--video={path}: expects a file that can be written: {error.strerror or error}") from None
+        raise UsageError(
+            f"--video={options.video}: expects a file that can be written: {error.strerror or error}"
+        ) from None
     except ValueError as error:
-        raise UsageError(f"--video={path}: {error}") from None
+        raise UsageError(f"--video={options.video}: {error}") from None
     height, width, _ = size[0]
     rate = 1 / (every * seconds)
-    return f"{path}: {width}x{height}, {len(size):,} pictures, {rate:.4g} per second, {written / 1e6:,.2f} MB"
+    return f"{options.video}: {width}x{height}, {len(size):,} pictures, {rate:.4g} per second, {written / 1e6:,.2f} MB"

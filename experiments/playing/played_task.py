@@ -101,8 +101,8 @@ def _not_to_be_shown(config: Config, factory: str | None) -> Environment:
     """The environment of `gym:ID`, or of `module:function`."""
     try:
         if factory is None or config.physics != OWN_PHYSICS:
-            return named_env(config, config.physics)
+            return named_env(config, config.physics, in_program=False)
         arguments = env_args.parse(config.env_args)
-        return env_of(config, factories.make_from(factory, arguments, config.max_episode_steps))
+        return env_of(config, factories.make_from(factory, arguments, config.max_episode_steps, in_program=False))
     except ValueError as error:
         raise UsageError(f"--env={factory or config.env}: {error}") from error

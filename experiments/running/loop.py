@@ -112,6 +112,7 @@ def train_loop(
     display: Display,
     stop: Callable[[], bool],
     failed: Callable[[], bool] = lambda: False,
+    keeps_failed: bool = True,
     start: Position = START,
     checkpoint_every: int = 0,
     save: Callable[[TrainState, Position], None] = lambda state, position: None,
@@ -126,6 +127,7 @@ def train_loop(
       stop: asked between chunks. Once it returns True, the state is saved and the loop returns.
       failed: the same, asked whether an environment on the host has failed. The state is then that before the step
         that failed; an evaluation that failed is not reported.
+      keeps_failed: whether that state is reported and saved. On several devices members stop at different steps.
       checkpoint_every: environment steps between calls of `save`, which is also called at the end; 0: never.
       save: called after the report of an evaluation at the same step.
       evaluated_at: called after each evaluation with the state, its env steps, and the members' returns [S, episodes],
@@ -229,16 +231,20 @@ def train_loop(
             state = sweep.advance(state, steps, learn)
             jax.block_until_ready(state.env_steps)
             pace.advanced(learn, steps, clock() - before)
-            done = int(state.env_steps) if failed() else done + steps * train.num_envs
+            if not failed():
+                done += steps * train.num_envs
+            elif keeps_failed:
+                done = int(state.env_steps)
             find_diverged(None)
         interrupted = over()
         if point in evaluations and not interrupted:
             evaluate_and_report()
             interrupted = failed()
         if interrupted:
-            save_here()
-            if done > reported:
-                send(None, None, {})
+            if keeps_failed or not failed():
+                save_here()
+                if done > reported:
+                    send(None, None, {})
             break
         if point in evaluations:
             reported = done

@@ -2,25 +2,22 @@
 
 import dataclasses
 from datetime import UTC, datetime
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import psutil
 
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import UsageError
 from experiments.commandline.presets import preset_settings
-from experiments.running import records, resume, run_config
+from experiments.running import memory, records, resume, run_config
 from experiments.running.run_config import Member, RunConfig
 from experiments.surroundings import jax_settings
 from sqt_jax import envs
 from sqt_jax.config import ENVIRONMENT, Config, TrainConfig
 from sqt_jax.envs import gym_ids
 from sqt_jax.envs.factories import is_factory
-from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, memory_estimate, named_env
-from sqt_jax.job_limits import memory_limits
+from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, named_env
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Environment
@@ -86,20 +83,15 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
             raise not_only_a_run(target.path) from None
         except OSError as error:
             raise UsageError(f"--out={options.out}: expects a folder that can be read: {error}") from None
-    config, count = target.members[0].config, len(target.members)
+    config = target.members[0].config
     output = _output(options, target.resumed, config.train)
     used_env = env or _named_env(config, output["env_processes"])
     if used_env.host is None and options.env_processes:
         raise UsageError(f"--env_processes: has no effect with {config.env}; expects an environment of Gymnasium's")
-    if used_env.host:
+    if used_env.host and used_env.host.processes:
         output["devices"] = _one_device(options.devices)
-    layout = _layout(count, output["devices"], typed=options.devices is not None)
-    needed, (free, where) = memory_estimate(config, layout.padded_size, used_env), _free_memory(len(layout.devices))
-    if needed > free:
-        raise UsageError(
-            f"--replay_capacity={config.train.replay_capacity}: {count} members need about "
-            f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free {where}; expects a smaller number, or fewer --seeds"
-        )
+    layout = _layout(len(target.members), output["devices"], typed=options.devices is not None)
+    memory.check(config, layout, used_env)
     return Plan(
         members=target.members,
         swept=target.swept,
@@ -123,7 +115,7 @@ def _named_env(config: Config, processes: int) -> Environment:
 
 def _one_device(given: int | None) -> int:
     if given not in (None, 1):
-        raise UsageError(f"--devices={given}: expects 1 with an environment on the host: all members share one call")
+        raise UsageError(f"--devices={given}: expects 1 with --env_processes: all members share the processes")
     return 1
 
 
@@ -159,10 +151,10 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         settings = preset | options.settings
         configs = [
             make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
-            for values in product(*options.sweep.values())
+            for values in options.configurations
         ]
-        on_host = env.host if env else default.physics in gym_ids.PHYSICS
-        jax_settings.start_jax(1 if on_host else options.devices or len(configs) * len(options.seeds))
+        in_processes = env.host and env.host.processes if env else options.env_processes
+        jax_settings.start_jax(1 if in_processes else options.devices or len(configs) * len(options.seeds))
         if env is None:
             check_physics(configs[0])
     except ConfigError as error:
@@ -180,7 +172,7 @@ def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
         # A new run: one command both starts a run and resumes it.
         return _Target(members=members, swept=swept, path=path, resumed=None)
     else:
-        run = resume.check(path, resume.read(path), wanted, 1 if env and env.host else options.devices)
+        run = resume.check(path, resume.read(path), wanted, options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
@@ -189,6 +181,8 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
     assert options.resume
     path = Path(options.resume)
     wanted: dict[str, Any] = options.settings | options.sweep
+    if len(options.sweep) > 1:
+        wanted |= run_config.swept_lists([*options.sweep], options.configurations)
     wanted |= {"algo": options.algo} if options.algo else {}
     wanted |= {"seeds": options.seeds} if options.seeds is not None else {}
     run = resume.read(path)
@@ -208,7 +202,7 @@ def _from_folder(options: flags.Options, env: Environment | None) -> _Target:
             wanted["env"] = envs.resolve(options.env)
         except ValueError as error:
             raise UsageError(f"--env: {error}") from None
-    run = resume.check(path, run, wanted, 1 if env and env.host else options.devices)
+    run = resume.check(path, run, wanted, options.devices)
     return _Target(members=resume.with_original_replay(run), swept=run.swept, path=path, resumed=run)
 
 
@@ -246,7 +240,7 @@ def _layout(num_members: int, devices: int | None, typed: bool) -> Layout:
 
 def _default_name(options: flags.Options) -> str:
     changed: dict[str, Any] = {} if options.preset == "paper" else {"preset": options.preset}
-    changed |= options.settings | options.sweep
+    changed |= options.settings | options.sweep | ({"paired": True} if options.paired else {})
     if options.seeds != flag_table.DEFAULT_SEEDS:
         changed["seeds"] = options.seeds
     return run_config.default_name(changed, datetime.now(UTC))
@@ -280,12 +274,3 @@ def name_taken(path: Path) -> UsageError:
     return UsageError(
         f"--name={path.name}: {path} already holds a run; expects another name, or --overwrite replaces it"
     )
-
-
-def _free_memory(devices: int) -> tuple[int, str]:
-    """Bytes available to a run, and what limits them: the accelerators, the machine or a limit of the job."""
-    stats = jax.local_devices()[0].memory_stats()
-    if stats and "bytes_limit" in stats:
-        return devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0)), "on the devices"
-    found = [(limit.left, f"under {limit.name}") for limit in memory_limits()]
-    return min([(psutil.virtual_memory().available, "here"), *found])

@@ -10,7 +10,6 @@ from experiments.running import records, run_config
 from experiments.running.run_config import Member, RunConfig
 from experiments.surroundings import jax_settings
 from sqt_jax.config import check_train
-from sqt_jax.envs import gym_ids
 from sqt_jax.experiment import check_physics
 from sqt_jax.settings import ConfigError
 
@@ -49,8 +48,9 @@ def check(path: Path, run: RunConfig, wanted: Mapping[str, Any], devices: int | 
     steps = wanted.get("steps", run.members[0].config.train.steps)
     members = [_with_train(_with_eval_physics(member, run), steps=steps) for member in run.members]
     config = members[0].config
-    # On the host one device is faster if it is the only one: XLA has a thread for each.
-    jax_settings.start_jax(1 if config.physics in gym_ids.PHYSICS else devices or len(members))
+    # One device is faster if it is the only one: XLA has a thread for each.
+    in_processes = run.content["output"].get("env_processes")
+    jax_settings.start_jax(1 if in_processes else devices or len(members))
     try:
         check_train(config.train)
         if not run.on_own_env:

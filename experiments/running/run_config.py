@@ -8,10 +8,11 @@ and its version, only of gym:ID and the like).
 """
 
 import json
+import math
 import os
 import re
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
@@ -65,9 +66,31 @@ def make_members(seeds: Sequence[int], configs: Sequence[Config]) -> list[Member
 
 
 def all_settings(members: Sequence[Member], swept: Sequence[str]) -> dict[str, Any]:
-    """All settings of a run by name; swept settings and `seeds` as tuples of their values."""
+    """All settings of a run by name; `seeds` as a tuple, and swept settings as in `swept_lists`."""
     settings = members[0].config.flat() | {"seeds": _values(member.seed for member in members)}
-    return settings | {name: _values(getattr(m.config.agent, name) for m in members) for name in swept}
+    configurations = [tuple(getattr(member.config.agent, name) for name in swept) for member in members]
+    return settings | swept_lists(swept, configurations)
+
+
+def swept_lists(swept: Sequence[str], configurations: Iterable[tuple[float, ...]]) -> dict[str, Any]:
+    """The lists of swept settings by name, and `paired`: whether they are no product.
+
+    Args:
+      configurations: the values of the settings `swept`, in the order of the members; repetitions do not count.
+
+    Returns:
+      For a product, each value once. Else a value per configuration, so that other pairs give other lists.
+    """
+    distinct = _values(configurations)
+    once = [_values(column) for column in zip(*distinct, strict=True)]
+    paired = len(distinct) != math.prod(map(len, once)) or distinct != tuple(product(*once))
+    return dict(zip(swept, zip(*distinct, strict=True) if paired else once, strict=True)) | {"paired": paired}
+
+
+def label(member: Member, swept: Sequence[str]) -> str:
+    """A member's name, as `seed=3,penalty_coef=0.5`. `swept`: swept settings other than penalty_coef."""
+    words = [f"{name}={getattr(member.config.agent, name):g}" for name in ("penalty_coef", *swept)]
+    return ",".join([f"seed={member.seed}", *words])
 
 
 def sizes_of(env: Environment | None) -> dict[str, int]:

@@ -18,13 +18,21 @@ from experiments.commandline.arguments import (
     UsageError,
     printable,
 )
-from experiments.commandline.flags import Options
-from experiments.running import files, folder_lock, manifests, records, resume, run_config
+from experiments.running import (
+    environment_errors,
+    files,
+    folder_lock,
+    manifests,
+    records,
+    resume,
+    run_config,
+    wandb_runs,
+)
 from experiments.running.announce import Announcer
 from experiments.running.checkpoints import CheckpointStore, Restored
 from experiments.running.csv_rows import MissingRows, WrongColumns
 from experiments.running.loop import START, Outcome, Position, train_loop
-from experiments.running.plan import Plan, make_plan, name_taken, not_only_a_run
+from experiments.running.plan import Plan, name_taken, not_only_a_run
 from experiments.running.progress import Display
 from experiments.running.run_config import Member
 from experiments.running.run_policies import RunPolicies
@@ -34,18 +42,15 @@ from sqt_jax.experiment import make_trainer, replay_of
 from sqt_jax.one_line import one_line
 from sqt_jax.policy_folders import BEST, LAST
 from sqt_jax.train import TrainState, make_sweep
-from sqt_jax.types import Array, Environment, HostError, Scalars
-
-ERROR_FILE = "error.txt"  # the traceback of an environment that failed
+from sqt_jax.types import Array, HostError, Scalars
 
 
-def start_session(options: Options, env: Environment | None, command: Sequence[str]) -> "Session":
-    """The session of a parsed command line. Raises `UsageError` as `make_plan`.
+def start_session(plan: Plan, command: Sequence[str]) -> "Session":
+    """The session of a plan. Raises `UsageError` if the run's folder cannot be made.
 
     A run without a --name gets a folder of its own, also if another process chose the same name at the same time.
     """
-    plan = make_plan(options, env)
-    if options.name is None and plan.resumed is None:
+    if plan.options.name is None and plan.resumed is None:
         try:
             plan = plan._replace(path=files.new_folder(plan.path))
         except OSError as error:
@@ -63,6 +68,7 @@ class Session:
 
     def __init__(self, plan: Plan, command: Sequence[str]):
         self.plan, self.command = plan, command
+        self.path = plan.path.absolute()  # an environment on the host may change the current folder
         self.console = console()
         self.display = Display(self.console, plan.train.steps, quiet=plan.options.quiet)
         self.announcer = Announcer(self.console, plan)
@@ -72,7 +78,7 @@ class Session:
         # Shapes of the members only: with a layout, a state has padding too.
         self.template = jax.eval_shape(make_sweep(trainer).init, *self.init_arguments)
         self.store = CheckpointStore(
-            plan.path / "checkpoint",
+            self.path / "checkpoint",
             replay_of(plan.config, plan.env),
             plan.layout,
             plan.output["keep_checkpoints"],
@@ -107,10 +113,11 @@ class Session:
             if self.plan.resumed:
                 self._record_resumption(self.plan.resumed)
                 self.store.remove_others()
+            tracked = self._track(tables)
             resumed_at = self.restored.position.env_steps if self.restored else None
             state_bytes, row_bytes = self.store.sizes(self.template)
             state_bytes += self.policies.bytes_in_checkpoint(self.template.agent)
-            self.announcer.start(resumed_at, (state_bytes, row_bytes))
+            self.announcer.start(resumed_at, (state_bytes, row_bytes), tracked)
             outcome = self._train(tables, lambda: bool(received))
             try:
                 curves = self._write_results(outcome)
@@ -120,6 +127,8 @@ class Session:
                 return FAILED
 
         self.announcer.end(outcome, summary, tables.swept, curves)
+        if line := environment_errors.unstable_steps(self.plan.env, outcome.state.timestep):
+            self.display.message(line)
         if failure := self._environment_error():
             return self._report_failure(failure)
         return INTERRUPTED if outcome.interrupted else DIVERGED if outcome.diverged else DONE
@@ -130,12 +139,7 @@ class Session:
 
     def _report_failure(self, error: HostError) -> int:
         """Writes the traceback to a file and prints the error in one line; returns the exit code."""
-        path, newest = self.plan.path / ERROR_FILE, self.store.newest()
-        try:
-            path.write_text(error.traceback)
-            where = f"traceback: {path}"
-        except OSError as problem:
-            where = f"the traceback cannot be written: {one_line(problem)}"
+        where, newest = environment_errors.write_error(self.path, self.plan.path, error), self.store.newest()
         saved = "there is no checkpoint" if newest is None else f"the last checkpoint is of step {newest:,}"
         print(printable(f"--env={self.plan.config.env}: {error.text}; {where}; {saved}"), file=sys.stderr)
         return FAILED
@@ -146,7 +150,7 @@ class Session:
         path, resumed = self.plan.path, self.plan.resumed
         with ExitStack() as stack:
             try:
-                stack.enter_context(folder_lock.locked(path, self.display.message))
+                stack.enter_context(folder_lock.locked(self.path, self.display.message))
             except folder_lock.Busy as busy:
                 flag = f"--resume={path}" if resumed else f"--name={path.name}"
                 raise UsageError(f"{flag}: {busy} is training {path}; expects another run") from None
@@ -169,12 +173,12 @@ class Session:
 
     def _is_finished(self, at: Position) -> bool:
         """Whether all steps, evaluations and results exist: then summary.json is not written again."""
-        results = self._summary.exists() and all((self.plan.path / name).is_dir() for name in (LAST, BEST))
+        results = self._summary.exists() and all((self.path / name).is_dir() for name in (LAST, BEST))
         return at.env_steps == at.evaluated == self.plan.train.steps and results
 
     @property
     def _summary(self) -> Path:
-        return self.plan.path / "summary.json"
+        return self.path / "summary.json"
 
     def _claim(self) -> None:
         """Makes the folder a run by writing config.json, after removing an existing run if --overwrite allows it."""
@@ -194,7 +198,7 @@ class Session:
                 len(plan.layout.devices),
                 plan.env.version,
             )
-            run_config.write(plan.path, content)
+            run_config.write(self.path, content)
         except records.NotARun:
             raise not_only_a_run(plan.path) from None
         except OSError as error:
@@ -211,10 +215,11 @@ class Session:
             content = run_config.resumed_content(
                 run.content, plan.train.steps, plan.output, at, self.command, len(plan.layout.devices)
             )
-            run_config.write(plan.path, content)
+            run_config.write(self.path, content)
             self._summary.unlink(missing_ok=True)
+            (self.path / environment_errors.FILE).unlink(missing_ok=True)
             for name in (LAST, BEST):
-                shutil.rmtree(plan.path / name, ignore_errors=True)
+                shutil.rmtree(self.path / name, ignore_errors=True)
         except OSError as error:
             raise _cannot_write(self.plan, error) from None
 
@@ -227,7 +232,7 @@ class Session:
             resumed_at = (restored.position.env_steps, restored.lengths) if restored else (-1, {})
         try:
             return records.Records(
-                plan.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, self.display.message
+                self.path, plan.members, plan.swept, plan.output["tensorboard"], resumed_at, self.display.message
             )
         except MissingRows as error:
             raise UsageError(
@@ -239,6 +244,14 @@ class Session:
             ) from None
         except OSError as error:
             raise _cannot_write(self.plan, error) from None
+
+    def _track(self, tables: records.Records) -> str:
+        """Starts to send the rows to Weights & Biases, if --wandb asks for it; returns a line that says where."""
+        plan = self.plan
+        runs = wandb_runs.open_runs(self.path, plan.members, tables.swept, plan.output["wandb"], self.display.message)
+        if runs:
+            tables.track(runs)
+        return runs.where if runs else ""
 
     def _train(self, tables: records.Records, stop: Callable[[], bool]) -> Outcome:
         def save(state: TrainState, position: Position) -> None:
@@ -269,6 +282,7 @@ class Session:
             display=self.display,
             stop=stop,
             failed=lambda: self._environment_error() is not None,
+            keeps_failed=not self.plan.layout.spread,
             start=self.restored.position if self.restored else START,
             checkpoint_every=self.plan.output["checkpoint_every"],
             save=save,
@@ -280,15 +294,15 @@ class Session:
     def _write_results(self, outcome: Outcome) -> bool:
         """Writes the policies and, if there are evaluations, curves.png; returns whether there are."""
         plan = self.plan
-        self.policies.write_results(plan.path, outcome.state.agent)
-        table = records.read_evaluations(plan.path / "evaluations.csv")
+        self.policies.write_results(self.path, outcome.state.agent)
+        table = records.read_evaluations(self.path / "evaluations.csv")
         if not len(table["member"]):
             return False
         try:
             # Here, so that a matplotlib that cannot be imported costs a figure, not the run.
             from experiments.evidence import figures
 
-            figures.draw_curves(table, plan.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
+            figures.draw_curves(table, self.path / "curves.png", f"{plan.config.algo} on {plan.config.env}")
         except Exception as error:  # of any type: no fault of a figure may cost the summary
             self.display.message(f"no curves.png: {one_line(error)}; experiments.plots draws it later")
             return False

@@ -5,9 +5,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from types import FrameType
 
 from experiments.commandline.arguments import INTERRUPTED
 
@@ -22,41 +21,68 @@ def announcements() -> list[signal.Signals]:
     return [number for number in ANNOUNCEMENTS if signal.getsignal(number) != signal.SIG_IGN]
 
 
+class Requests:
+    """The signals that have asked to stop.
+
+    A SIGTERM within a second of another one counts as the same: with a batch system, both the system and
+    `experiments.sweep`, which forwards its own, send one to this process. In a job that a launcher started on a
+    cluster (the variable SQT_JOB), all SIGTERMs do: SLURM's scancel may repeat one.
+    """
+
+    def __init__(self) -> None:
+        self.same_seconds = math.inf if "SQT_JOB" in os.environ else SAME_SIGNAL_SECONDS
+        self.last_sigterm = -math.inf
+        self.received: list[int] = []
+
+    def add(self, number: int, now: float) -> bool:
+        """Whether the signal `number` at the time `now`, in seconds, is the second SIGINT or SIGTERM."""
+        if number == signal.SIGTERM:
+            since, self.last_sigterm = now - self.last_sigterm, now
+            if since < self.same_seconds:
+                return False
+        second = number in SIGNALS and any(earlier in SIGNALS for earlier in self.received)
+        self.received.append(number)
+        return second
+
+
 @contextmanager
 def stop_on_signal() -> Iterator[list[int]]:
     """Collects the signals in the list that it yields; a second SIGINT or SIGTERM ends the process at once.
 
-    A SIGTERM within a second of another one counts as the same: with a batch system, both the system and
-    `experiments.sweep`, which forwards its own, send one to this process. In a job that a launcher started on a
-    cluster (the variable SQT_JOB), all SIGTERMs do: SLURM's scancel may repeat one. An announcement that is ignored
-    stays so (`nohup`).
+    An announcement that is ignored stays so (`nohup`). Python calls handlers when the main thread is back from the
+    compiled program. A thread sees the second signal earlier: an environment may never return.
     """
-    received: list[int] = []
-    last_sigterm = -math.inf
-    same_seconds = math.inf if "SQT_JOB" in os.environ else SAME_SIGNAL_SECONDS
-
-    def handle(number: int, _: FrameType | None) -> None:
-        nonlocal last_sigterm
-        if number == signal.SIGTERM:
-            since, last_sigterm = time.monotonic() - last_sigterm, time.monotonic()
-            if since < same_seconds:
-                return
-        if number in SIGNALS and any(earlier in SIGNALS for earlier in received):
-            # Not by an exception: it could be raised inside a callback of the compiled program.
-            os._exit(INTERRUPTED)
-        if not received:
-            # Not by print, which may be the very call that is interrupted.
-            with suppress(OSError):
-                os.write(2, b"stopping when the running chunk of training or evaluation ends\n")
-        received.append(number)
-
-    handled = [*SIGNALS, *announcements()]
     if threading.current_thread() is not threading.main_thread():
-        handled = []  # Python allows handlers in the main thread only: signals are its caller's
-    before = {number: signal.signal(number, handle) for number in handled}
+        yield []  # Python allows handlers in the main thread only: signals are its caller's
+        return
+    received: list[int] = []
+    handled = [*SIGNALS, *announcements()]
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    watcher = threading.Thread(target=_watch, args=(reader, handled), daemon=True, name="signals")
+    watcher.start()
+    before_fd = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # gets the number of each signal as a byte
+    before = {number: signal.signal(number, lambda number, _: received.append(number)) for number in handled}
     try:
         yield received
     finally:
         for number, handler in before.items():
             if handler is not None:  # it was not installed from Python
                 signal.signal(number, handler)
+        signal.set_wakeup_fd(before_fd)
+        os.close(writer)
+        watcher.join()
+
+
+def _watch(reader: int, handled: Sequence[int]) -> None:
+    """Reads the numbers of signals until the other end is closed, and ends the process at the second request."""
+    requests = Requests()
+    while numbers := os.read(reader, 100):
+        for number in filter(handled.__contains__, numbers):
+            if not requests.received:
+                with suppress(OSError):
+                    os.write(2, b"stopping when the running chunk of training or evaluation ends\n")
+            if requests.add(number, time.monotonic()):
+                # Not by an exception: it could be raised inside a callback of the compiled program.
+                os._exit(INTERRUPTED)
+    os.close(reader)

@@ -65,9 +65,8 @@ def make(name: str, physics: str | None = None, **options: Any) -> Environment:
       name: see `resolve`. `gym:MODULE:ID` imports the module.
       physics: one of `physics_of(name)`; None is the first of them.
       **options: of the physics. mjx and warp: `iterations` and `ls_iterations`, the maximum steps of the constraint
-        solver and of its line search (None: the model file's). mujoco: `num_threads`. Brax's have none. gym:ID:
-        `arguments`, `max_episode_steps` and `processes`, as in `gym_ids.make_gym`. playground:NAME: `arguments` and
-        `max_episode_steps`, as in `playground_envs.load`.
+        solver and of its line search (None: the model file's). mujoco: `num_threads`. Brax's have none. gym:ID: as in
+        `gym_ids.make_gym`. playground:NAME: `arguments` and `max_episode_steps`, as in `playground_envs.load`.
 
     Raises:
       ValueError: the environment or the physics is unknown, or the physics cannot run on this machine (`lacks`).

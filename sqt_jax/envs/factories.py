@@ -19,7 +19,11 @@ def is_factory(name: str) -> bool:
 
 
 def make_from(
-    name: str, arguments: Mapping[str, Any] | None = None, max_episode_steps: int = 0, processes: int = 0
+    name: str,
+    arguments: Mapping[str, Any] | None = None,
+    max_episode_steps: int = 0,
+    processes: int = 0,
+    in_program: bool = True,
 ) -> Environment:
     """The environment that a function of yours returns: an `Environment`, or one of Gymnasium.
 
@@ -31,6 +35,7 @@ def make_from(
       arguments: keyword arguments of the function.
       max_episode_steps: a time limit; only for Gymnasium's.
       processes: as in `host.host_environment`; only for Gymnasium's.
+      in_program: as in `gym_ids.from_gymnasium`.
 
     Raises:
       ValueError: there is no such module or function, it fails, or it returns something else. The text is one line
@@ -44,15 +49,16 @@ def make_from(
         make = getattr(importlib.import_module(module), function)
         make = partial(make, **arguments) if arguments else make
         env = make()
-    except Exception as error:  # of any type: it is the user's code
+        if _is_gymnasium(env):
+            env.close()
+    except (Exception, SystemExit) as error:  # of any type: it is the user's code
         raise ValueError(with_place(error, __file__)) from error
     if isinstance(env, Environment):
         if max_episode_steps or processes:
             raise ValueError("--max_episode_steps and --env_processes have no effect with an Environment in JAX")
         return env
     if _is_gymnasium(env):
-        env.close()
-        return from_gymnasium(name, make, max_episode_steps, processes)
+        return from_gymnasium(name, make, max_episode_steps, processes, in_program)
     raise ValueError(
         "expects a function that returns an Environment (sqt_jax.make_environment) or a gymnasium.Env, not a "
         f"{type(env).__name__}"

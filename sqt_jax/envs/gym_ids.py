@@ -32,7 +32,11 @@ def module_of(name: str) -> str | None:
 
 
 def make_gym(
-    name: str, arguments: Mapping[str, Any] | None = None, max_episode_steps: int = 0, processes: int = 0
+    name: str,
+    arguments: Mapping[str, Any] | None = None,
+    max_episode_steps: int = 0,
+    processes: int = 0,
+    in_program: bool = True,
 ) -> Environment:
     """The environment of a name with its prefix. This imports the module in the name.
 
@@ -40,6 +44,7 @@ def make_gym(
       arguments: keyword arguments of the environment.
       max_episode_steps: the time limit; 0: the environment's own.
       processes: as in `host.host_environment`.
+      in_program: as in `from_gymnasium`.
 
     Raises:
       ValueError: there is no such environment, it cannot be made, or it cannot be trained on. The text is one line.
@@ -55,24 +60,33 @@ def make_gym(
     except gymnasium.error.Error as error:
         known = [PREFIX + known for known in gymnasium.registry]
         raise ValueError(f"{error}{did_you_mean(name, known)}") from None
-    except Exception as error:  # of any type: the module is the user's
+    except (Exception, SystemExit) as error:  # of any type: the module is the user's
         raise ValueError(with_place(error, __file__)) from error
-    limit = {"max_episode_steps": max_episode_steps} if max_episode_steps else {}
-    make = partial(gymnasium.make, spec, disable_env_checker=True, **{**limit, **(arguments or {})})
-    return from_gymnasium(name, make, processes=processes)
+    given = {"disable_env_checker": True, **(arguments or {})}
+    if max_episode_steps:
+        if "max_episode_steps" in given:
+            raise ValueError("env_args: expects no max_episode_steps with --max_episode_steps, which sets it")
+        given["max_episode_steps"] = max_episode_steps
+    make = partial(gymnasium.make, spec, **given)
+    return from_gymnasium(name, make, processes=processes, in_program=in_program)
 
 
-def from_gymnasium(name: str, make: Callable[[], Any], max_episode_steps: int = 0, processes: int = 0) -> Environment:
+def from_gymnasium(
+    name: str, make: Callable[[], Any], max_episode_steps: int = 0, processes: int = 0, in_program: bool = True
+) -> Environment:
     """The environment that plays in the Gymnasium environments that `make` makes.
 
     Args:
       make: makes one. It is called several times, and with `processes` pickled.
       max_episode_steps: a time limit in addition to the environment's own; 0: none.
       processes: as in `host.host_environment`.
+      in_program: whether a compiled program steps it; not where its episodes are only played by hand (`Host.make`).
 
     Raises:
       ValueError: it fails, has no time limit, spaces that are not supported, or computes with JAX in this process.
     """
+    from gymnasium.wrappers import TimeLimit
+
     from sqt_jax.envs.host import host_environment
 
     if max_episode_steps:
@@ -81,18 +95,21 @@ def from_gymnasium(name: str, make: Callable[[], Any], max_episode_steps: int = 
         env = make()
         limit = time_limit(env)
         in_jax, version = uses_jax(env), version_of(env)
+        bounded = isinstance(env, TimeLimit) and env._max_episode_steps == limit
         env.close()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(with_place(error, __file__)) from error
     if not limit:
         raise ValueError("has no time limit, so that an evaluation might not end; add --max_episode_steps=N")
-    if in_jax and not processes:
+    if in_jax and in_program and not processes:
         raise ValueError("computes with JAX, which would wait for itself inside our program; add --env_processes=N")
+    if not bounded:  # a wrapper around its time limit may hide the end of an episode
+        make = partial(limited, make, limit)
     try:
         return host_environment(name, partial(quiet, make), limit, processes, version)
     except ValueError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(one_line(error)) from error
 
 
@@ -135,4 +152,21 @@ def uses_jax(env: Any) -> bool:
     kinds = {f"{kind.__module__}.{kind.__name__}" for kind in type(env.unwrapped).__mro__}
     if "gymnasium.envs.functional_jax_env.FunctionalJaxEnv" in kinds:
         return True
-    return any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(list(vars(env.unwrapped).values())))
+    return _holds_jax(vars(env.unwrapped))
+
+
+def _holds_jax(tree: Any) -> bool:
+    """Whether a JAX array is in `tree` or its branches, whose dictionaries may have keys that cannot be sorted."""
+    todo, seen = [tree], {}
+    while todo:
+        node = todo.pop()
+        if isinstance(node, jax.Array):
+            return True
+        if id(node) in seen:
+            continue
+        seen[id(node)] = node  # kept, so that no other object gets its number
+        if isinstance(node, dict):
+            todo += node.values()
+        elif branches := jax.tree_util.default_registry.flatten_one_level(node):
+            todo += branches[0]
+    return False

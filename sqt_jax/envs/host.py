@@ -1,16 +1,16 @@
 """Environments on the host: Gymnasium's, whose episodes cannot be part of the compiled program.
 
-The program calls the host once a step, for all environments of all members together. The contract is that of
+The program calls the host once a step, for all environments of a device's members together. The contract is that of
 `autoreset`, a test per sentence (tests/test_host.py), with these differences:
 
 - `terminated` and `truncated` are the environment's own.
-- `reset` and `step` are not pure: an `Environment` plays one batch of episodes at a time, and a step has to follow the
-  newest one. `Host.separate` gives another environment, whose episodes are its own.
+- `reset` and `step` are not pure: an `Environment` plays one batch of episodes at a time on each device, and a step has
+  to follow the newest one. `Host.separate` gives another environment, whose episodes are its own.
 - A start is drawn by `env.reset(seed=...)`, with a seed made of the time step's key and the steps made since.
 - A checkpoint does not contain the running episodes: `Host.restart` begins new ones.
 - An action that is not a number is not shown to the environment; the step counts as unstable.
 - After an exception in an environment, `Host.failed` is true for all time steps, their numbers are 0, and their
-  episodes terminate; `Host.error` is the exception. `reset` tries again.
+  episodes terminate; `Host.error` is the exception. Other devices stop at their next step. `reset` tries again.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,9 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from sqt_jax.envs import gym_spaces
-from sqt_jax.envs.host_episodes import CALL_WORDS, Episodes
+from sqt_jax.envs.host_episodes import CALL_WORDS, DeviceEpisodes
 from sqt_jax.envs.host_rows import LocalRows, Make, Rows, Steps
+from sqt_jax.members import device_index
 from sqt_jax.types import Array, Environment, Host, Metrics, TimeStep
 
 
@@ -68,9 +69,9 @@ def host_environment(
             return LocalRows(make, count)
         return host_processes.ProcessRows(make, count, processes, sizes)
 
-    def environment(family: list[Episodes]) -> Environment:
+    def environment(family: list[DeviceEpisodes]) -> Environment:
         """An environment with episodes of its own, which join those of its family."""
-        episodes = Episodes(make_rows, *sizes)
+        episodes = DeviceEpisodes(make_rows, *sizes)
         family.append(episodes)
         functions = episode_functions(episodes)
 
@@ -84,6 +85,7 @@ def host_environment(
             error=lambda: next((member.error for member in family if member.error), None),
             separate=lambda: environment(family),
             close=close,
+            processes=processes,
             make=make,
         )
         return Environment(
@@ -118,11 +120,14 @@ class EpisodeFunctions(NamedTuple):
     restart: Callable[[TimeStep], TimeStep]
 
 
-def episode_functions(episodes: Episodes) -> EpisodeFunctions:
+def episode_functions(episodes: DeviceEpisodes) -> EpisodeFunctions:
     """The functions of one environment that play `episodes` through calls to the host."""
     observation_size = episodes.observation_size
     shape = jax.ShapeDtypeStruct((episodes.out_words,), jnp.uint32)
     start_on_host, step_on_host = _callback(episodes.start, shape), _callback(episodes.step, shape)
+
+    def words(*parts: Array) -> Array:
+        return jnp.concatenate([device_index().astype(jnp.uint32)[None], *parts])
 
     def timestep_of(out: Array, before: HostState) -> TimeStep:
         packed = jax.lax.bitcast_convert_type(out[CALL_WORDS + 1 :], jnp.float32)
@@ -143,7 +148,7 @@ def episode_functions(episodes: Episodes) -> EpisodeFunctions:
         )
 
     def start(state: HostState) -> TimeStep:
-        timestep = timestep_of(start_on_host(jnp.concatenate([state.key, state.steps[None]])), state)
+        timestep = timestep_of(start_on_host(words(state.key, state.steps[None])), state)
         return timestep._replace(terminated=jnp.zeros((), bool))  # a start ends no episode, a failed one neither
 
     def reset(key: Array) -> TimeStep:
@@ -162,7 +167,7 @@ def episode_functions(episodes: Episodes) -> EpisodeFunctions:
         state = state._replace(steps=state.steps + 1)
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1, 1)
         bits = jax.lax.bitcast_convert_type(action, jnp.uint32)
-        return timestep_of(step_on_host(jnp.concatenate([state.call, state.key, state.steps[None], bits])), state)
+        return timestep_of(step_on_host(words(state.call, state.key, state.steps[None], bits)), state)
 
     return EpisodeFunctions(reset=reset, step=step, restart=lambda timestep: start(timestep.state))
 

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import warnings
 from contextlib import suppress
 from functools import partial
@@ -89,6 +90,7 @@ class Group(gymnasium.Env):
         if self.in_worker:
             for number in IGNORED:
                 signal.signal(number, signal.SIG_IGN)
+            threading.Thread(target=_end_with_the_run, daemon=True).start()
         observation_size, action_size = sizes
         self.shape = size, Steps.packed_size(observation_size)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, self.shape, np.float32)
@@ -116,6 +118,15 @@ class Group(gymnasium.Env):
         self.rows.close()
         if self.in_worker:
             os._exit(0)
+
+
+def _end_with_the_run() -> None:
+    """Ends this worker when its run has ended without closing it, even if an environment is waiting for ever."""
+    run = multiprocessing.parent_process()
+    assert run is not None
+    run.join()
+    time.sleep(SECONDS_TO_CLOSE)  # the worker sees the end itself, unless it is in a step, and closes its environments
+    os._exit(1)
 
 
 STARTS, STEPS = 0, 1  # the first word of a row

@@ -3,6 +3,7 @@
 The numbers of a step are packed in one row per environment, because they cross to the compiled program in one array.
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from sqt_jax.envs import gym_spaces
 from sqt_jax.envs.autoreset import LARGEST
+from sqt_jax.one_line import one_line
 
 KEY_WORDS = 3  # of a start: two of the key, and the steps made before it
 Make = Callable[[], gymnasium.Env]
@@ -50,7 +52,7 @@ class Rows(Protocol):
         """One step: actions [K, A], keys [K, 3] of the starts of episodes that follow -> packed rows [K, P] float32."""
 
     def close(self) -> None:
-        """Closes the environments."""
+        """Closes the environments, as `close`."""
 
 
 class LocalRows:
@@ -111,7 +113,7 @@ class LocalRows:
         """As in `Rows`."""
         envs, self.envs = self.envs, []
         for env in envs:
-            env.close()
+            close(env)
 
     def _begin(self, i: int, key: np.ndarray, steps: Steps) -> None:
         """Starts an episode in environment `i`."""
@@ -139,12 +141,22 @@ class LocalRows:
         return packed, Steps.of(packed, size)
 
 
+def close(env: gymnasium.Env) -> None:
+    """Closes an environment. Its error is a warning: no result depends on it any more."""
+    try:
+        env.close()
+    except (Exception, SystemExit) as error:
+        warnings.warn(f"an environment could not be closed: {one_line(error)}", stacklevel=2)
+
+
 def start_seed(key: np.ndarray) -> int:
     """The seed of `reset` for a start with this key [3] uint32: 31 bits, which every random generator accepts."""
     return int(np.random.SeedSequence(key.tolist()).generate_state(1)[0] >> 1)
 
 
 def _float32(number: Any) -> np.ndarray:
+    if number is None:  # NumPy would make it NaN
+        raise ValueError("reward: expects a number, not None")
     with np.errstate(over="ignore"):
         return np.asarray(number, np.float32)
 

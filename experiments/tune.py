@@ -1,0 +1,79 @@
+"""Tunes settings: `python -m experiments.tune --algo=td3_sqt --env=cheetah --space=penalty_coef=0..1 --steps=20000`.
+
+Optuna proposes trials. One run of experiments.run trains a batch of them, each with all seeds, in one program. The best
+trial is then trained again on seeds that tuning never saw, beside its baseline, tuned over the same space with as many
+trials. OUT gets the trials (study.log, which optuna-dashboard opens; trials.csv), the runs, and a report: tuning.md,
+tuning.csv and tuning.png.
+
+Flags other than those below go to every run, for example --steps=20000 or --physics=mujoco. The same command continues
+a study that was stopped or killed. Exit codes: 0 done, 1 a run failed, 2 bad usage, 3 a member diverged on fresh seeds
+or in all trials, 130 interrupted.
+"""
+
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+
+from absl import app, flags
+
+from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, reject_folder
+from experiments.commandline.known_flags import parse_known
+from experiments.commandline.path_flags import define_path
+from experiments.launchers import launcher_flags
+from experiments.launchers.choice import make_launcher
+from experiments.launchers.launcher import Launcher
+from experiments.tuning.tune_flags import OBJECTIVES, SAMPLERS, Given, Options, check_flags
+
+FLAGS = flags.FLAGS
+
+
+def main(argv: Sequence[str]) -> int:
+    """Tunes; `argv` has the program name and the flags for every run. Returns the exit code."""
+    try:
+        options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
+        reject_folder("--out", options.out)
+        launcher = launcher_flags.given(FLAGS, options.out)
+        workers, here = launcher.workers or 1, launcher.launcher == "local"
+        if not here:  # on a cluster, the number of batches is not the launcher's
+            launcher = launcher._replace(workers=None)
+        first = [make_launcher(launcher)]  # now, so that its flags are checked
+        return tune(options, lambda: first.pop() if first else make_launcher(launcher), workers, workers if here else 0)
+    except UsageError as error:
+        print(printable(str(error)), file=sys.stderr)
+        return BAD_USAGE
+    except OSError as error:
+        print(printable(f"--out={FLAGS.out}: expects a folder that can be written: {error}"), file=sys.stderr)
+        return BAD_USAGE
+
+
+def tune(options: Options, launcher: Callable[[], Launcher], workers: int, workers_here: int) -> int:
+    """Tunes; returns the exit code. Arguments as of `Session` and its `run`."""
+    from experiments.tuning.session import Session  # imports Optuna and matplotlib
+
+    command = shlex.join(["python", "-m", "experiments.tune", *sys.argv[1:]])
+    return Session(options, launcher, workers, FLAGS.retries, command).run(workers_here)
+
+
+if __name__ == "__main__":
+    flags.DEFINE_string("algo", None, "The algorithm.")
+    flags.DEFINE_string("env", None, "The task.")
+    flags.DEFINE_string(
+        "space",
+        None,
+        "What is tuned: NAME=LOW..HIGH, NAME=log:LOW..HIGH, NAME=LOW..HIGH:STEP or 'NAME=A|B|C', separated by commas.",
+    )
+    flags.DEFINE_integer("trials", 64, "Trials, of the algorithm and of its baseline.", 1)
+    flags.DEFINE_integer("batch", 16, "Trials that are asked for and trained together.", 1, 5000)
+    flags.DEFINE_list("seeds", ["0", "1"], "Seeds of each trial.")
+    flags.DEFINE_string("sampler", "tpe", f"Who proposes: {', '.join(SAMPLERS)}.")
+    flags.DEFINE_integer("sampler_seed", 0, "Seed of the proposals.", 0)
+    flags.DEFINE_string(
+        "objective",
+        "score",
+        f"Value of a trial: {', '.join(OBJECTIVES)}: the best, or the last evaluation of the mean over seeds.",
+    )
+    flags.DEFINE_integer("final_seeds", 10, "How many fresh seeds the winner is trained on.", 1)
+    define_path("out", "runs/tuned", "The folder of the study. On a cluster: one that all machines share.")
+    launcher_flags.define("Batches that are asked for and trained side by side.")
+    flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
+    app.run(main, flags_parser=parse_known)

@@ -1,0 +1,59 @@
+"""A Ray cluster of several nodes on this machine, and the runs that they train."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+
+class Run:
+    """A run that a Ray worker trains."""
+
+    def __init__(self, worker: psutil.Process, process: psutil.Process):
+        self.worker, self.process = worker, process
+        flags = dict(word[2:].partition("=")[::2] for word in process.cmdline() if word.startswith("--"))
+        self.path = Path(flags["out"]) / flags["env"] / flags["algo"] / flags["name"]
+
+    def is_half_done(self) -> bool:
+        """Whether it has been evaluated after its start, and is not at its end."""
+        table = self.path / "evaluations.csv"
+        return table.exists() and 3 <= table.read_text().count("\n") < 5
+
+
+@contextmanager
+def ray_nodes(number: int) -> Iterator[Any]:
+    """A `ray.cluster_utils.Cluster` of a head without CPUs and `number` nodes with one each."""
+    from ray.cluster_utils import Cluster
+
+    small = {"object_store_memory": 80 * 10**6, "include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **small})
+    try:
+        for _ in range(number):
+            cluster.add_node(num_cpus=1, **small)
+        yield cluster
+    finally:
+        cluster.shutdown()
+
+
+def runs_on(node: Any) -> list[Run]:
+    """The runs of a node of the cluster."""
+    found = []
+    (raylet,) = node.all_processes["raylet"]
+    with suppress(psutil.Error):
+        for worker in psutil.Process(raylet.process.pid).children():
+            with suppress(psutil.Error, KeyError):
+                found += [Run(worker, child) for child in worker.children() if "experiments.run" in child.cmdline()]
+    return found
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 120) -> Any:
+    """The first result of `condition` that is true."""
+    give_up = time.monotonic() + seconds
+    while time.monotonic() < give_up:
+        if found := condition():
+            return found
+        time.sleep(0.05)
+    raise AssertionError("waited in vain")
