@@ -11,18 +11,18 @@ others. The exit code is the worst of the runs': 130 interrupted, 1 failed, 2 ba
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from absl import app, flags
 
 from experiments.commandline.arguments import BAD_USAGE, DONE, UsageError, printable, reject_folder
+from experiments.commandline.known_flags import parse_known
 from experiments.commandline.path_flags import define_path
 from experiments.grids import status
 from experiments.grids.grid import GRIDS, OWN_GRID, make_cells, needs_training
 from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import repeat_command, submit_and_leave, train_cells
-from experiments.launchers import slurm_status
-from experiments.launchers.choice import LAUNCHERS, LauncherOptions, make_launcher
+from experiments.launchers import launcher_flags, slurm_status
+from experiments.launchers.choice import make_launcher
 from experiments.launchers.slurm import SlurmLauncher
 
 FLAGS = flags.FLAGS
@@ -40,8 +40,7 @@ def main(argv: Sequence[str]) -> int:
             _say(*(repeat_command(cell) for cell in cells if needs_training(cell)))
             return DONE
         reject_folder("--out", out)
-        options: dict[str, Any] = {name: FLAGS[name].value for name in LauncherOptions._fields if name != "out"}
-        launcher = make_launcher(LauncherOptions(out=out, **options))
+        launcher = make_launcher(launcher_flags.given(FLAGS, out))
         if FLAGS.detach and isinstance(launcher, SlurmLauncher):
             return submit_and_leave(cells, launcher, _say)
         with collected_signals() as received:
@@ -82,16 +81,10 @@ if __name__ == "__main__":
     flags.DEFINE_list("tasks", [], "Tasks, if not the grid's.")
     flags.DEFINE_string("split", None, "seeds:K: each run's seeds in cells of K, which tables pool as one row.")
     define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/. On a cluster: a folder that all machines share.")
-    flags.DEFINE_string("launcher", "local", f"Where runs are started: {', '.join(LAUNCHERS)}.")
-    flags.DEFINE_integer("workers", None, "With local: runs side by side, each on GPUs or cores of its own.", 1)
-    flags.DEFINE_integer("max_jobs", None, "With slurm: jobs of the array that run at the same time; default: all.", 1)
-    flags.DEFINE_string("slurm", None, "With slurm: options of sbatch, as partition=gpu,gpus_per_node=1,time=04:00:00.")
-    define_path("slurm_setup", None, "With slurm: a file of shell lines that each job runs first, as module load cuda.")
+    launcher_flags.define("With local: runs side by side, each on GPUs or cores of its own.")
     flags.DEFINE_bool("detach", None, "With slurm: submit and leave; --status shows the runs.")
-    flags.DEFINE_string("ray", None, "With ray: resources of a run, as num_cpus=2,num_gpus=1,resources.NAME=1.")
     flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
     flags.DEFINE_bool("fail_fast", False, "Stop at the first run that fails.")
     flags.DEFINE_bool("status", False, "Print the state of the grid's runs and train nothing.")
     flags.DEFINE_bool("dry_run", False, "Print a command per run that is not finished, and train nothing.")
-    # known_only: unknown flags stay in argv.
-    app.run(main, flags_parser=lambda argv: FLAGS(argv, known_only=True))
+    app.run(main, flags_parser=parse_known)

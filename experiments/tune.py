@@ -10,34 +10,21 @@ a study that was stopped or killed. Exit codes: 0 done, 1 a run failed, 2 bad us
 or in all trials, 130 interrupted.
 """
 
-import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from absl import app, flags
 
 from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, reject_folder
+from experiments.commandline.known_flags import parse_known
 from experiments.commandline.path_flags import define_path
-from experiments.launchers.choice import LAUNCHERS, LauncherOptions, make_launcher
+from experiments.launchers import launcher_flags
+from experiments.launchers.choice import make_launcher
 from experiments.launchers.launcher import Launcher
 from experiments.tuning.tune_flags import OBJECTIVES, SAMPLERS, Given, Options, check_flags
 
 FLAGS = flags.FLAGS
-
-
-def parse_known(argv: Sequence[str]) -> list[str]:
-    """Parses the flags of this command; returns the other words. A wrong value ends the process with one line."""
-    try:
-        return FLAGS(argv, known_only=True)
-    except flags.Error as error:
-        line = str(error).removeprefix("flag ").splitlines()[0]
-        found = re.match(r"-*(\w+)=", line)
-        if found and found[1] in FLAGS:
-            line = f"--{found[1]}: expects {FLAGS[found[1]].parser.syntactic_help}"
-        print(printable(line), file=sys.stderr)
-        sys.exit(BAD_USAGE)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -45,12 +32,12 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
         reject_folder("--out", options.out)
-        here = FLAGS.launcher == "local"
-        names = ("launcher", "max_jobs", "slurm", "slurm_setup", "ray")
-        own: dict[str, Any] = {name: FLAGS[name].value for name in names}
-        launcher = LauncherOptions(out=options.out, workers=FLAGS.workers if here else None, **own)
+        launcher = launcher_flags.given(FLAGS, options.out)
+        workers, here = launcher.workers or 1, launcher.launcher == "local"
+        if not here:  # on a cluster, the number of batches is not the launcher's
+            launcher = launcher._replace(workers=None)
         first = [make_launcher(launcher)]  # now, so that its flags are checked
-        return tune(options, lambda: first.pop() if first else make_launcher(launcher), FLAGS.workers if here else 0)
+        return tune(options, lambda: first.pop() if first else make_launcher(launcher), workers, workers if here else 0)
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
@@ -59,12 +46,12 @@ def main(argv: Sequence[str]) -> int:
         return BAD_USAGE
 
 
-def tune(options: Options, launcher: Callable[[], Launcher], workers_here: int) -> int:
+def tune(options: Options, launcher: Callable[[], Launcher], workers: int, workers_here: int) -> int:
     """Tunes; returns the exit code. Arguments as of `Session` and its `run`."""
     from experiments.tuning.session import Session  # imports Optuna and matplotlib
 
     command = shlex.join(["python", "-m", "experiments.tune", *sys.argv[1:]])
-    return Session(options, launcher, FLAGS.workers, FLAGS.retries, command).run(workers_here)
+    return Session(options, launcher, workers, FLAGS.retries, command).run(workers_here)
 
 
 if __name__ == "__main__":
@@ -87,11 +74,6 @@ if __name__ == "__main__":
     )
     flags.DEFINE_integer("final_seeds", 10, "How many fresh seeds the winner is trained on.", 1)
     define_path("out", "runs/tuned", "The folder of the study. On a cluster: one that all machines share.")
-    flags.DEFINE_string("launcher", "local", f"Where runs are started: {', '.join(LAUNCHERS)}.")
-    flags.DEFINE_integer("workers", 1, "Batches that are asked for and trained side by side.", 1)
-    flags.DEFINE_integer("max_jobs", None, "With slurm: jobs of the array that run at the same time; default: all.", 1)
-    flags.DEFINE_string("slurm", None, "With slurm: options of sbatch, as partition=gpu,gpus_per_node=1,time=04:00:00.")
-    define_path("slurm_setup", None, "With slurm: a file of shell lines that each job runs first, as module load cuda.")
-    flags.DEFINE_string("ray", None, "With ray: resources of a run, as num_cpus=2,num_gpus=1,resources.NAME=1.")
+    launcher_flags.define("Batches that are asked for and trained side by side.")
     flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
     app.run(main, flags_parser=parse_known)

@@ -333,6 +333,7 @@ DAMAGED = {
     "checkpoint is a link": (linked("checkpoint"), "checkpoint in it is a link"),
     "policy is a link": (linked("policy"), "policy in it is a link"),
     "events are a link": (linked("tensorboard"), "tensorboard in it is a link"),
+    "wandb is a link": (linked("wandb"), "wandb in it is a link"),
     "table is a folder": (a_folder("evaluations.csv"), "evaluations.csv has lost rows"),
     "table has lost rows": (lambda path: truncated(path.parent / "metrics.csv"), "metrics.csv has lost rows"),
 }

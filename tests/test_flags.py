@@ -105,6 +105,8 @@ BAD = {
     "--temperature=warm": "--temperature=warm: expects a number, a list like 0.1,0.2, or auto",
     "--hidden=64,wide": "--hidden=64,wide: expects whole numbers like 256,256",
     "--tensorboard=maybe": "--tensorboard=maybe: expects true or false",
+    "--wandb=a/b": "--wandb=a/b: expects the name of a project, up to 128 characters without /\\#?%:",
+    f"--wandb={'a' * 129}": f"--wandb={'a' * 40}: expects the name of a project, up to 128 characters without /\\#?%:",
     "--seeds=": "--seeds=: expects whole numbers like 0,1,2",
     "--seeds=0,1,0": "--seeds: expects each value once, got 0 2 times",
     "--seeds=-1": "--seeds=-1: expects whole numbers from 0 to 4294967295",
@@ -137,6 +139,27 @@ def test_algorithm_and_environment_are_required(missing):
 @pytest.mark.parametrize("word", ["--help", "-h"])
 def test_help_overrides_everything_else(word):
     assert flags.parse(["run", "--stepz=5", word]) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "project"),
+    [
+        ([], None),
+        (["--wandb"], "sqt_jax"),
+        (["--wandb", "--quiet"], "sqt_jax"),
+        (["--wandb=ants"], "ants"),
+        (["--wandb", "ants"], "ants"),
+        (["--wandb=true"], "sqt_jax"),
+        (["--wandb=false"], ""),
+        (["--wandb="], ""),
+        (["--nowandb"], ""),
+    ],
+)
+def test_wandb_has_an_optional_project(monkeypatch, given, project):
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    assert parse(*given).wandb == project
+    monkeypatch.setenv("WANDB_PROJECT", "mine")
+    assert parse(*given).wandb == ("mine" if project == "sqt_jax" else project)
 
 
 def test_td7s_settings_are_parsed():
@@ -218,3 +241,18 @@ def test_a_path_that_is_no_file_is_rejected(tmp_path):
     for path, message in cases.items():
         with pytest.raises(flags.UsageError, match=message):
             flags.parse(["run", f"--config={path}", "--algo=td3", "--env=ant"])
+
+
+@pytest.mark.parametrize(
+    ("text", "project"),
+    [("ants", "ants"), ("true", "sqt_jax"), ("yes", "sqt_jax"), ("false", ""), ("no", ""), ('""', None)],
+)
+def test_wandb_in_a_file_is_a_project_or_a_switch(tmp_path, monkeypatch, text, project):
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    path = write(tmp_path, f"wandb: {text}\n")
+    if project is None:
+        with pytest.raises(flags.UsageError, match="wandb expects a number, a word or a list of them"):
+            parse(f"--config={path}")
+    else:
+        assert parse(f"--config={path}").wandb == project
+        assert parse(f"--config={path}", "--nowandb").wandb == ""

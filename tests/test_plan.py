@@ -159,8 +159,8 @@ def test_a_folder_needs_no_other_flags(tmp_path):
     assert again.members == made.members
 
 
-DEFAULTS = {"tensorboard": True, "checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
-DEFAULTS |= {"tuned": ""}
+DEFAULTS = {"checkpoint_every": 25_000, "keep_checkpoints": 2, "devices": None, "env_processes": 0}
+DEFAULTS |= {"tensorboard": True, "wandb": "", "tuned": ""}
 
 
 @pytest.mark.parametrize(
@@ -175,6 +175,10 @@ DEFAULTS |= {"tuned": ""}
         ({"devices": 99}, ["--devices=1"], {"devices": 1}),
         ({"devices": 0}, [], {}),
         ({"tensorboard": False}, ["--tensorboard"], {"tensorboard": True}),
+        ({"wandb": "ants"}, [], {"wandb": "ants"}),
+        ({"wandb": "ants"}, ["--wandb=bees"], {"wandb": "bees"}),
+        ({"wandb": "ants"}, ["--nowandb"], {"wandb": ""}),
+        ({"wandb": True}, [], {}),
         # Values that no command line could have given are ignored.
         ({"checkpoint_every": -20, "keep_checkpoints": 0, "tensorboard": 1}, [], {}),
         ({"checkpoint_every": "often", "keep_checkpoints": True, "tensorboard": None, "more": 1}, [], {}),

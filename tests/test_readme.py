@@ -154,7 +154,8 @@ def test_commands_that_train_grids_are_valid(argv):
     command = [sys.executable, "-m", "experiments.sweep", *argv[1:], "--tasks=nowhere"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith("--tasks: "), done.stderr
-    own = re.findall(r'(?:DEFINE_\w+|define_path)\("(\w+)"', (ROOT / "experiments/sweep.py").read_text())
+    text = "".join((ROOT / "experiments" / name).read_text() for name in ("sweep.py", "launchers/launcher_flags.py"))
+    own = re.findall(r'(?:DEFINE_\w+|define_path)\("(\w+)"', text)
     rest = [word for word in argv[1:] if word.removeprefix("--").partition("=")[0] not in own]
     assert flags.parse(["run", "--algo=td3", "--env=ant", *rest])
 

@@ -216,6 +216,17 @@ def test_only_a_runs_own_files_are_removed(tmp_path):
     assert path.exists() and not any(path.iterdir())
 
 
+def test_wandbs_link_to_its_log_is_removed_and_not_followed(tmp_path):
+    path, log = tmp_path / "run", tmp_path / "core.log"
+    log.write_text("x")
+    (path / "wandb" / "run-1" / "logs").mkdir(parents=True)
+    (path / "wandb" / "run-1" / "logs" / "debug-core.log").symlink_to(log)
+    for name in ("config.json", "wandb.json"):
+        (path / name).write_text("x")
+    records.remove_run(path)
+    assert log.exists() and not any(path.iterdir())
+
+
 @pytest.mark.parametrize("kind", ["foreign file", "link", "linked folder", "no run"])
 def test_a_folder_with_other_files_than_a_run_is_not_removed(tmp_path, kind):
     path, other = tmp_path / "run", tmp_path / "other"

@@ -59,19 +59,6 @@ def test_in_a_job_of_a_cluster_all_sigterms_are_one(monkeypatch):
     assert requests.add(signal.SIGINT, 110.0)
 
 
-def test_in_a_job_of_a_cluster_all_sigterms_are_one(monkeypatch):
-    """SLURM's scancel may send one again after seconds, while the run still saves."""
-    codes, now = [], []
-    monkeypatch.setenv("SQT_JOB", "slurm 1_0")
-    monkeypatch.setattr(signals.os, "_exit", codes.append)
-    monkeypatch.setattr(signals.time, "monotonic", lambda: now[-1])
-    with signals.stop_on_signal() as received:
-        for at in (100.0, 105.0, 160.0):
-            now.append(at)
-            signal.raise_signal(signal.SIGTERM)
-        assert received == [signal.SIGTERM] and codes == []
-
-
 def test_the_handlers_are_the_old_ones_afterwards():
     before = [signal.getsignal(number) for number in signals.SIGNALS]
     with signals.stop_on_signal():

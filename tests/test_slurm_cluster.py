@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,7 +22,7 @@ from experiments.launchers.cell import read_ended
 ROOT = Path(__file__).resolve().parent.parent
 TASK = "scaled_pendulum:make"
 TINY = [
-    *("--seeds=0", "--steps=30000", "--warmup_steps=500", "--eval_every=2500", "--eval_episodes=1", "--hidden=8"),
+    *("--seeds=0", "--warmup_steps=500", "--eval_every=2500", "--eval_episodes=1", "--hidden=8"),
     *("--batch_size=16", "--checkpoint_every=1000", "--quiet"),
 ]
 ALGOS = ("td3", "td3_sqt")
@@ -54,11 +55,12 @@ def slurm(hidden):
 class Sweep:
     """`experiments.sweep` with a grid of TD3 and TD3 with SQT, in a process."""
 
-    def __init__(self, slurm, out, grid, *arguments):
+    def __init__(self, slurm, out, grid, *arguments, steps=30000):
         self.slurm = slurm
-        self.cells = make_cells(grid, ALGOS, [TASK], out, TINY)
+        flags = [f"--steps={steps}", *TINY]
+        self.cells = make_cells(grid, ALGOS, [TASK], out, flags)
         self.command = [sys.executable, "-m", "experiments.sweep", f"--tasks={TASK}", f"--algos={','.join(ALGOS)}"]
-        self.command += [f"--grid={grid}", f"--out={out}", *TINY, *arguments]
+        self.command += [f"--grid={grid}", f"--out={out}", *flags, *arguments]
         path = [str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]
         self.variables = dict(slurm.variables) | {"PYTHONPATH": os.pathsep.join(filter(None, path))}
 
@@ -105,12 +107,9 @@ def wait_until(condition, process):
 
 
 def send(sweep, name, job):
-    """Sends a signal to a job. scancel is ended then: it sends again if other elements of the array still wait."""
+    """Sends a signal to a job. scancel is ended soon: it sends again while other elements of the array still wait."""
     scancel = subprocess.Popen(["scancel", f"--signal={name}", job], env=sweep.variables)
-    with suppress(subprocess.TimeoutExpired):
-        assert scancel.wait(2) == 0
-    scancel.kill()
-    scancel.wait()
+    threading.Timer(2, lambda: (scancel.kill(), scancel.wait())).start()
 
 
 @contextmanager
@@ -201,7 +200,7 @@ def test_what_happens_to_jobs_does_not_change_a_row(slurm, tmp_path):
 
 def test_a_user_may_cancel_one_job_or_all(slurm, tmp_path):
     """A plain scancel ends a cell for good. Ctrl-C on the sweep lets the others save, and drops those that wait."""
-    sweep = Sweep(slurm, tmp_path, "lr=0.001,0.0003", "--launcher=slurm", "--max_jobs=2")
+    sweep = Sweep(slurm, tmp_path, "lr=0.001,0.0003", "--launcher=slurm", "--max_jobs=2", steps=1000000)
     cancelled, saved, second, dropped = sweep.cells
     process = sweep.start()
     wait_until(lambda: sweep.saved_and_runs(cancelled), process)
@@ -217,7 +216,7 @@ def test_a_user_may_cancel_one_job_or_all(slurm, tmp_path):
     assert any(saved.path.glob("checkpoint/step_*")) and not dropped.path.exists()
     assert not {"RUNNING", "PENDING"} & set(slurm.jobs().values())
     code, printed = sweep.run("--status")
-    assert code == 0 and printed.count("  interrupted  ") >= 2 and "waiting" in printed
+    assert code == 0 and printed.endswith("4 runs: 4 interrupted\n")
 
 
 def test_a_node_that_does_not_see_the_folder_is_named(slurm, hidden):

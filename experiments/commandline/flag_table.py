@@ -37,6 +37,12 @@ class OutputConfig:
         high=1000,
     )
     tensorboard: bool = setting(True, "also write TensorBoard events")
+    wandb: str = setting(
+        "",
+        "also send the rows to this project of Weights & Biases, a run per member; without a name: WANDB_PROJECT or "
+        "sqt_jax; --nowandb turns it off",
+        default_text="off",
+    )
     tuned: str = setting(
         "",
         "how the settings were tuned, for a footnote in tables: experiments.tune sets it",

@@ -50,6 +50,7 @@ class Options(NamedTuple):
     devices: int | None
     env_processes: int | None
     tensorboard: bool | None
+    wandb: str | None  # a project; empty: none
     tuned: str | None
     quiet: bool
 
@@ -107,18 +108,25 @@ def _values(argv: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_values(argv: Sequence[str]) -> list[str]:
-    """The words with a value for `--resume` and `--env_processes` where none follows."""
-    values = {"resume": LATEST, "env_processes": str(usable_cores())}
+    """The words with a value for `--resume`, `--env_processes` and `--wandb` where none follows.
+
+    A value of `--wandb` may also be true or false, as in a YAML file.
+    """
+    project = os.environ.get("WANDB_PROJECT") or "sqt_jax"
+    values = {"resume": LATEST, "env_processes": str(usable_cores()), "wandb": project}
+    switched = {"--nowandb": "--wandb=", "--wandb=false": "--wandb=", "--wandb=true": f"--wandb={project}"}
     following = [*argv[1:], "-"]
     return [
-        f"{word}={values[name]}" if (name := word.lstrip("-")) in values and word != name and after[:1] == "-" else word
+        f"{word}={values[name]}"
+        if (name := word.lstrip("-")) in values and word != name and after[:1] == "-"
+        else switched.get(word, word)
         for word, after in zip(argv, following, strict=True)
     ]
 
 
 def _file_values(name: str) -> dict[str, Any]:
     """The flags of a YAML file, parsed as those of a command line."""
-    switches = {flag.name for group in FLAGS.values() for flag in group if flag.parse is None}
+    switches = {flag.name for group in FLAGS.values() for flag in group if flag.parse is None} | {"wandb"}
     try:
         arguments = config_file.arguments(Path(paths.expanded(name)), switches)
     except (config_file.InvalidConfigFile, ValueError) as error:
@@ -161,6 +169,7 @@ def parse(argv: Sequence[str], needs_env: bool = True) -> Options | None:
     for name, about in settings_of(OutputConfig).items():
         if output[name] is not None:
             _check(about, output[name])
+    _check_project(output["wandb"] or "")
 
     preset = own["preset"] or "paper"
     if preset not in PRESETS:
@@ -248,6 +257,11 @@ def _check_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
             raise UsageError(f"--seeds={seed}: expects whole numbers from 0 to {MAX_SEED}")
     _reject_duplicates("seeds", seeds)
     return seeds
+
+
+def _check_project(name: str) -> None:
+    if len(name) > 128 or set(name) & set("/\\#?%:") or not name.isprintable():
+        raise UsageError(f"--wandb={name[:40]}: expects the name of a project, up to 128 characters without /\\#?%:")
 
 
 def _folder(flag: str, text: str) -> str:

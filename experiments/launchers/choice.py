@@ -16,10 +16,10 @@ class LauncherOptions(NamedTuple):
     launcher: str
     out: Path
     workers: int | None = None  # local
-    max_jobs: int | None = None  # slurm, as all below
-    slurm: str | None = None
-    slurm_setup: str | None = None
-    detach: bool | None = None
+    max_jobs: int | None = None  # slurm
+    slurm: str | None = None  # slurm
+    slurm_setup: str | None = None  # slurm
+    detach: bool | None = None  # slurm
     ray: str | None = None  # ray
 
 

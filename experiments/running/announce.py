@@ -28,12 +28,13 @@ class Announcer:
     def __init__(self, console: Console, plan: Plan):
         self.console, self.plan, self.quiet = console, plan, plan.options.quiet
 
-    def start(self, resumed_at: int | None, sizes: tuple[int, int]) -> None:
+    def start(self, resumed_at: int | None, sizes: tuple[int, int], tracked: str = "") -> None:
         """The members, the share of evaluation and the size of checkpoints.
 
         Args:
           resumed_at: env steps of the checkpoint that training resumes from; None: it starts at step 0.
           sizes: bytes of a checkpoint without replay rows, and of the rows of one env step.
+          tracked: a line about Weights & Biases, if any.
         """
         if self.quiet:
             return
@@ -62,6 +63,8 @@ class Announcer:
                 f"a checkpoint every {every:,} steps, the last {plan.output['keep_checkpoints']} kept: "
                 f"{state / 1e6:,.1f} MB each, plus one copy of the replay, up to {row * train.capacity / 1e6:,.1f} MB"
             )
+        if tracked:
+            self._line(tracked)
 
     def already_finished(self) -> None:
         if not self.quiet:

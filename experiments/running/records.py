@@ -13,12 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED
 from experiments.evidence.statistics import iqm, score
 from experiments.running import files
 from experiments.running.csv_rows import CsvTable, MissingRows
 from experiments.running.events import Events
 from experiments.running.loop import Outcome, Report
-from experiments.running.run_config import Member
+from experiments.running.past_rows import past_rows
+from experiments.running.run_config import Member, label
+from experiments.running.wandb_runs import WandbRuns
 from sqt_jax import bias
 
 # The columns of every evaluations.csv; swept settings other than penalty_coef follow.
@@ -52,8 +55,10 @@ RUN_FILES = (
     "summary.json.part",
     "curves.png",
     "error.txt",
+    "wandb.json",
+    "wandb.json.part",
 )
-RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "policy_best", "policy_best.part", "tensorboard")
+RUN_FOLDERS = ("checkpoint", "policy", "policy.part", "policy_best", "policy_best.part", "tensorboard", "wandb")
 # Left by a run that died before it wrote its config.json.
 LEFTOVERS = {"lock", "config.json.part"}
 
@@ -75,7 +80,8 @@ def removable_files(path: Path) -> set[str]:
     if not path.exists():
         return set()
     names = {item.name for item in path.iterdir()} - {"lock"}
-    links = any(item.is_symlink() for item in path.rglob("*"))
+    # wandb links its folders to a log file of its own. Removing a folder does not follow links.
+    links = any(item.is_symlink() for item in path.rglob("*") if path / "wandb" not in item.parents)
     if links or (names and ("config.json" not in names or names - {*RUN_FILES, *RUN_FOLDERS})):
         raise NotARun
     return names
@@ -141,12 +147,14 @@ class Records:
         purge_step = None if env_steps is None else env_steps + 1  # earlier events from there on are ignored
         self._events: list[Events] = []
         if tensorboard:
-            labels = [_label(member, self.swept) for member in members]
+            labels = [label(member, self.swept) for member in members]
             try:
-                self._events = [Events(path / "tensorboard" / label, purge_step) for label in labels]
+                self._events = [Events(path / "tensorboard" / name, purge_step) for name in labels]
             except OSError as error:  # too many open files, no fsync, ...: the tables have the same numbers
                 self.warn(f"no events for TensorBoard: {error.strerror}")
         self._disk_full = False
+        self._wandb: WandbRuns | None = None
+        self._exit_codes: list[int] | None = None  # of the members; None: the run has not ended
 
     def __enter__(self) -> "Records":
         return self
@@ -158,6 +166,14 @@ class Records:
         with contextlib.suppress(OSError):
             for events in self._events:
                 events.close()
+        if self._wandb:
+            self._wandb.close(self._exit_codes)
+
+    def track(self, runs: WandbRuns) -> None:
+        """Sends the rows that TensorBoard gets to `runs` too, and those so far first. `runs` is closed at the end."""
+        self._wandb = runs
+        for env_steps, rows in past_rows(self.path, self.swept):
+            runs.add(rows, env_steps)
 
     def lengths(self) -> dict[str, int]:
         """Bytes of each table, once its rows are on disk.
@@ -176,6 +192,7 @@ class Records:
         If the disk is full, `warn` is called once; rows wait in memory, and TensorBoard events end.
         """
         written = True
+        rows: list[dict[str, float]] = []  # as in TensorBoard
         for index, member in enumerate(self.members):
             metrics = {name: float(values[index]) for name, values in report.metrics.items()}
             bias_metrics = {name: float(values[index]) for name, values in report.bias.items()}
@@ -202,14 +219,18 @@ class Records:
                 written &= self._evaluations.write(row | evaluation | measured)
             if report.metrics:
                 self._metric_rows.append(row | metrics | bias_metrics)
+            values = {f"eval/{name}": value for name, value in evaluation.items()}
+            values |= {f"train/{name}": value for name, value in metrics.items()}
+            rows.append({name: value for name, value in values.items() if not math.isnan(value)})
             if self._events:
-                values = {f"eval/{name}": value for name, value in evaluation.items()}
-                values |= {f"train/{name}": value for name, value in metrics.items()}
                 try:
-                    self._events[index].add({n: v for n, v in values.items() if not math.isnan(v)}, report.env_steps)
+                    self._events[index].add(rows[-1], report.env_steps)
                 except OSError as error:
                     self._events = []
                     self.warn(f"no more events for TensorBoard: {error.strerror}")
+        # An interval that a signal has cut short is measured again, to its end, by the process that resumes.
+        if self._wandb and report.returns is not None:
+            self._wandb.add(rows, report.env_steps)
         written &= self._write_metric_rows()
         if not written and not self._disk_full:
             self.warn("the disk has no room for rows of evaluations.csv and metrics.csv: they are kept until it has")
@@ -230,6 +251,8 @@ class Records:
     def summary(self, outcome: Outcome) -> dict[str, Any]:
         """Writes summary.json and returns its content."""
         table = read_evaluations(self.path / "evaluations.csv")
+        otherwise = INTERRUPTED if outcome.interrupted else DONE
+        self._exit_codes = [DIVERGED if i in outcome.diverged else otherwise for i in range(len(self.members))]
         summary = {
             "status": "interrupted" if outcome.interrupted else "diverged" if outcome.diverged else "done",
             "env_steps": outcome.env_steps,
@@ -314,11 +337,6 @@ def summarise(table: Mapping[str, np.ndarray]) -> dict[str, Any]:
                 }
             )
     return {"groups": grouped, "members": members}
-
-
-def _label(member: Member, swept: Sequence[str]) -> str:
-    words = [f"{name}={getattr(member.config.agent, name):g}" for name in ("penalty_coef", *swept)]
-    return ",".join([f"seed={member.seed}", *words])
 
 
 def _without_nan(value: Any) -> Any:

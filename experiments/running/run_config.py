@@ -87,6 +87,12 @@ def swept_lists(swept: Sequence[str], configurations: Iterable[tuple[float, ...]
     return dict(zip(swept, zip(*distinct, strict=True) if paired else once, strict=True)) | {"paired": paired}
 
 
+def label(member: Member, swept: Sequence[str]) -> str:
+    """A member's name, as `seed=3,penalty_coef=0.5`. `swept`: swept settings other than penalty_coef."""
+    words = [f"{name}={getattr(member.config.agent, name):g}" for name in ("penalty_coef", *swept)]
+    return ",".join([f"seed={member.seed}", *words])
+
+
 def sizes_of(env: Environment | None) -> dict[str, int]:
     """The sizes of an environment handed in, for config.json; empty without one."""
     return {"observation_size": env.observation_size, "action_size": env.action_size} if env else {}

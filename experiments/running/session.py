@@ -18,7 +18,16 @@ from experiments.commandline.arguments import (
     UsageError,
     printable,
 )
-from experiments.running import environment_errors, files, folder_lock, manifests, records, resume, run_config
+from experiments.running import (
+    environment_errors,
+    files,
+    folder_lock,
+    manifests,
+    records,
+    resume,
+    run_config,
+    wandb_runs,
+)
 from experiments.running.announce import Announcer
 from experiments.running.checkpoints import CheckpointStore, Restored
 from experiments.running.csv_rows import MissingRows, WrongColumns
@@ -104,10 +113,11 @@ class Session:
             if self.plan.resumed:
                 self._record_resumption(self.plan.resumed)
                 self.store.remove_others()
+            tracked = self._track(tables)
             resumed_at = self.restored.position.env_steps if self.restored else None
             state_bytes, row_bytes = self.store.sizes(self.template)
             state_bytes += self.policies.bytes_in_checkpoint(self.template.agent)
-            self.announcer.start(resumed_at, (state_bytes, row_bytes))
+            self.announcer.start(resumed_at, (state_bytes, row_bytes), tracked)
             outcome = self._train(tables, lambda: bool(received))
             try:
                 curves = self._write_results(outcome)
@@ -234,6 +244,14 @@ class Session:
             ) from None
         except OSError as error:
             raise _cannot_write(self.plan, error) from None
+
+    def _track(self, tables: records.Records) -> str:
+        """Starts to send the rows to Weights & Biases, if --wandb asks for it; returns a line that says where."""
+        plan = self.plan
+        runs = wandb_runs.open_runs(self.path, plan.members, tables.swept, plan.output["wandb"], self.display.message)
+        if runs:
+            tables.track(runs)
+        return runs.where if runs else ""
 
     def _train(self, tables: records.Records, stop: Callable[[], bool]) -> Outcome:
         def save(state: TrainState, position: Position) -> None:
