@@ -16,10 +16,10 @@ import pytest
 from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError
 from experiments.launchers import ray_cluster, tied
 from experiments.launchers.cell import Cell, Ended, write_ended
-from experiments.launchers.ray_cluster import RayLauncher, forwarded_variables, make
+from experiments.launchers.ray_cluster import RayLauncher, driver_variables, forwarded_variables, make
 from experiments.launchers.ray_options import RayOptions
 
-BELONGS = "expects a Ray cluster that this machine belongs to"
+BELONGS = f"expects {ray_cluster.BELONGING}"
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = [Cell(str(index), "td3", Path("out") / str(index), ("--steps=5",)) for index in range(3)]
 START = """
@@ -124,7 +124,10 @@ def test_a_lost_cluster_ends_all_cells(launch, end, why):
             "time.sleep(600)",
             f"RAY_ADDRESS=10.0.0.7:6379: {BELONGS}; none answers within 1 s",
         ),
-        ("tell(connected=True); time.sleep(600)", "RAY_ADDRESS=10.0.0.7:6379: its nodes do not answer within 1 s"),
+        (
+            "tell(connected=True); time.sleep(600)",
+            "--launcher=ray: expects all nodes of the Ray cluster; none answers within 1 s",
+        ),
     ],
 )
 def test_what_is_refused_is_one_line(launch, tmp_path, monkeypatch, script, line):
@@ -136,6 +139,23 @@ def test_what_is_refused_is_one_line(launch, tmp_path, monkeypatch, script, line
         launcher.submit(CELLS)
     assert str(error.value) == line
     assert not any((tmp_path / "out").iterdir())
+
+
+def test_a_missing_token_is_named(launch, monkeypatch):
+    monkeypatch.setattr(ray_cluster, "CONNECT_SECONDS", 1.0)
+    script = (
+        "import sys, time; print('RPC error: InvalidAuthToken: missing', file=sys.stderr, flush=True); time.sleep(600)"
+    )
+    line = f"RAY_ADDRESS=10.0.0.7:6379: {BELONGS}, and RAY_AUTH_MODE=token with the token of the cluster"
+    with pytest.raises(UsageError, match=f"^{line}$"), launch(script) as launcher:
+        launcher.submit(CELLS)
+
+
+def test_a_cluster_that_is_started_reports_to_nobody_and_has_a_token_of_its_own():
+    assert driver_variables("10.0.0.7:6379", {}) == {}
+    tokens = {driver_variables(None, {})["RAY_AUTH_TOKEN"] for _ in range(2)}
+    assert len(tokens) == 2 and driver_variables(None, {})["RAY_AUTH_MODE"] == "token"
+    assert driver_variables(None, {"RAY_AUTH_MODE": "disabled"}) == {"RAY_USAGE_STATS_ENABLED": "0"}
 
 
 def test_nothing_to_train_needs_no_cluster(launch, tmp_path):

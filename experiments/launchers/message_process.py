@@ -57,10 +57,14 @@ class MessageProcess:
         """
         return self._inbox.get(timeout=seconds) if seconds else self._inbox.get_nowait()
 
+    def errors(self) -> str:
+        """What it has written to its standard error."""
+        self._errors.seek(0)
+        return self._errors.read().decode(errors="replace")
+
     def last_error(self) -> str:
         """The first sentence of the last line that it wrote to its standard error."""
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        lines = self.errors().strip().splitlines()
         line = LOG_PREFIX.sub("", lines[-1].strip()).partition(". ")[0] if lines else "its process was killed"
         return printable(line)[:MAX_TEXT]
 

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import queue
+import secrets
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -21,7 +22,7 @@ START_SECONDS = 120.0  # of a cluster on this machine
 READY_SECONDS = 180.0  # of the check of all nodes
 FORWARDED = ("JAX_", "XLA_")  # beginnings of the variables that cells have from the sweep
 DRIVER = (sys.executable, "-m", "experiments.launchers.ray_driver")
-QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}  # else a cluster that is started here reports to Ray's authors
+BELONGING = "a Ray cluster that this machine belongs to"
 
 
 class RayLauncher:
@@ -65,7 +66,7 @@ class RayLauncher:
 
     def _start(self) -> MessageProcess:
         expected = self._held.enter_context(node_check.expected_here(self._out))
-        driver = self._held.enter_context(MessageProcess(self._program, QUIET))
+        driver = self._held.enter_context(MessageProcess(self._program, driver_variables(self._address, os.environ)))
         driver.send(
             address=self._address,
             options=self._options._asdict(),
@@ -73,11 +74,11 @@ class RayLauncher:
             variables=forwarded_variables(os.environ),
             folder=os.getcwd(),
         )
-        name = f"RAY_ADDRESS={self._address}" if self._address else "--launcher=ray"
-        what = "a Ray cluster that this machine belongs to" if self._address else "to start a Ray cluster"
-        seconds = CONNECT_SECONDS if self._address else START_SECONDS
-        _wait_for("connected", driver, seconds, f"{name}: expects {what}; none answers within {seconds:.0f} s")
-        _wait_for("ready", driver, READY_SECONDS, f"{name}: its nodes do not answer within {READY_SECONDS:.0f} s")
+        if self._address:
+            _wait_for("connected", driver, CONNECT_SECONDS, f"RAY_ADDRESS={self._address}: expects {BELONGING}")
+        else:
+            _wait_for("connected", driver, START_SECONDS, "--launcher=ray: expects to start a Ray cluster")
+        _wait_for("ready", driver, READY_SECONDS, "--launcher=ray: expects all nodes of the Ray cluster")
         return driver
 
     def _ended_by(self, message: dict[str, Any] | None) -> list[Ended]:
@@ -100,13 +101,15 @@ class RayLauncher:
         self._held.close()  # the driver disconnects, and stops a cluster of its own
 
 
-def _wait_for(word: str, driver: MessageProcess, seconds: float, otherwise: str) -> None:
+def _wait_for(word: str, driver: MessageProcess, seconds: float, expected: str) -> None:
     """Waits for a message of the driver's. Raises `UsageError` if another one comes, or none."""
     try:
         message = driver.receive(seconds)
     except queue.Empty:
         driver.kill()  # Ray goes on trying
-        raise UsageError(otherwise) from None
+        if "InvalidAuthToken" in driver.errors():
+            raise UsageError(f"{expected}, and RAY_AUTH_MODE=token with the token of the cluster") from None
+        raise UsageError(f"{expected}; none answers within {seconds:.0f} s") from None
     if message is None:
         raise UsageError(f"--launcher=ray: Ray ended: {driver.last_error()}")
     if word not in message:
@@ -117,6 +120,18 @@ def _done_unheard(cell: Cell) -> Ended | None:
     """How a cell ended, if it is done and the driver did not hear of it."""
     ended = read_ended(cell)
     return ended if ended and ended.code in (DONE, DIVERGED) else None
+
+
+def driver_variables(address: str | None, variables: Mapping[str, str]) -> dict[str, str]:
+    """Variables for the process that connects to a cluster, or starts one (None)."""
+    if address:
+        return {}
+    quiet = {"RAY_USAGE_STATS_ENABLED": "0"}  # else the cluster reports to Ray's authors
+    if "RAY_AUTH_MODE" in variables:
+        return quiet
+    # Else others on the network could run code in it; and Ray would leave its token in the user's home folder, where
+    # clusters of the user's own would find it.
+    return quiet | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
 
 
 def forwarded_variables(variables: Mapping[str, str]) -> dict[str, str]:
