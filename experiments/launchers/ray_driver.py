@@ -55,7 +55,8 @@ def main() -> None:
 
     settings = Settings(**json.loads(sys.stdin.readline()))
     inbox: queue.Queue[dict[str, Any] | None] = queue.Queue()
-    threading.Thread(target=_read, args=(inbox,), daemon=True).start()
+    reader = threading.Thread(target=_read, args=(inbox,), daemon=True)
+    reader.start()
     try:
         _connect(settings.address)
         tell(connected=True)
@@ -68,6 +69,7 @@ def main() -> None:
     except ray_errors.ClusterLost as error:
         tell(lost=str(error))
     ray.shutdown()
+    reader.join()  # Python cannot end while a thread reads its input
 
 
 def _read(inbox: queue.Queue[dict[str, Any] | None]) -> None:
