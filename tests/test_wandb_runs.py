@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import sys
 import threading
 
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("no_service")
 def no_service():
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("WANDB_SERVICE", raising=False)
-        patch.setenv("WANDB_ERROR_REPORTING", "false")
+        patch.delenv("WANDB_CACHE_DIR", raising=False)
         yield
 
 
@@ -229,6 +230,14 @@ def test_a_missing_login_is_one_line(tmp_path, wandb):
     assert [name for name, _ in wandb.calls] == ["setup", "teardown"]
 
 
+def test_the_packages_process_logs_to_the_runs_folder_and_our_variables_stay_as_they_were(tmp_path, wandb, monkeypatch):
+    seen, setup, before = {}, wandb.setup, dict(os.environ)
+    monkeypatch.setattr(wandb, "setup", lambda settings: seen.update(os.environ) or setup(settings))
+    opened(tmp_path, [])
+    assert (seen["WANDB_CACHE_DIR"], seen["WANDB_ERROR_REPORTING"]) == (str(tmp_path), "false")
+    assert dict(os.environ) == before
+
+
 def test_offline_needs_no_login(tmp_path, wandb):
     wandb.mode, wandb.logged_in = "offline", False
     runs = opened(tmp_path, [])
@@ -296,14 +305,18 @@ def test_a_full_disk_ends_the_rows_since_wandb_json_could_not_prevent_doubles(tm
     ]
 
 
-def test_runs_that_cannot_be_ended_are_one_line(tmp_path, wandb, monkeypatch):
+@pytest.mark.parametrize(("code", "limit"), [(0, 0.2), (130, 0.1)], ids=["at the end", "after a signal"])
+def test_runs_that_cannot_be_ended_are_one_line(tmp_path, wandb, monkeypatch, code, limit):
     lines, gate = [], threading.Event()
     runs = opened(tmp_path, lines)
-    monkeypatch.setattr(wandb_runs, "CLOSE_SECONDS", 0.1)
+    monkeypatch.setattr(wandb_runs, "CLOSE_SECONDS", 0.2)
+    monkeypatch.setattr(wandb_runs, "STOP_SECONDS", 0.1)
     monkeypatch.setattr(wandb, "teardown", gate.wait)
     wandb.before_finish = gate.wait
-    runs.close([0, 0])
-    assert lines == ["W&B may lack the last rows, evaluations.csv has them: TimeoutError: no answer within 0.1 seconds"]
+    runs.close([code, code])
+    assert lines == [
+        f"W&B may lack the last rows, evaluations.csv has them: TimeoutError: no answer within {limit} seconds"
+    ]
     gate.set()
 
 

@@ -60,12 +60,12 @@ class SlurmLauncher:
         self._jobs |= queued
         new = [cell for cell in cells if cell not in queued]
         for cell in new:
-            cell.path.parent.mkdir(parents=True, exist_ok=True)
             cell.ended_file.unlink(missing_ok=True)  # what it says is of an earlier job
         if new:
             jobs = dict(zip(new, self._array(new), strict=True))
             self._jobs |= jobs  # all before a file is written: they are ended if that fails
             for cell, submitted in jobs.items():
+                cell.path.parent.mkdir(parents=True, exist_ok=True)
                 slurm_records.write(cell, submitted)
 
     def ended(self) -> list[Ended]:

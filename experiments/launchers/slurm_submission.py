@@ -12,7 +12,7 @@ import sys
 import time
 import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,6 +42,7 @@ def submit_array(submission: Submission, cells: Sequence[Cell]) -> list[Submitte
 
     logging.getLogger("submitit").setLevel(logging.CRITICAL)
     folder = submission.out / FOLDER / f"{time.strftime('%Y%m%d-%H%M%S')}_{uuid.uuid4().hex[:8]}"
+    created = [path for path in (folder.parent, submission.out) if not path.exists()]
     folder.mkdir(parents=True)
     token = folder.absolute() / "token"
     token.touch()
@@ -56,6 +57,9 @@ def submit_array(submission: Submission, cells: Sequence[Cell]) -> list[Submitte
             jobs = executor.submit_array(functions)
     except (FailedJobError, FailedSubmissionError, OSError) as error:
         shutil.rmtree(folder, ignore_errors=True)
+        for path in created:
+            with suppress(OSError):  # something else is in it by now
+                path.rmdir()
         text = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
         raise UsageError(f"--slurm: expects options that sbatch accepts: {text[:500]}") from None
     finally:

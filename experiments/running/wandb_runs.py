@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.commandline.arguments import FAILED
+from experiments.commandline.arguments import FAILED, INTERRUPTED
 from experiments.running import run_config, wandb_file
 from experiments.running.in_threads import in_threads
 from experiments.running.run_config import Member
@@ -28,6 +28,8 @@ from sqt_jax.one_line import one_line
 FOLDER = "wandb"  # of the package's own files, in the run's folder
 MAX_RUNS = 200  # opening them took 9 seconds against a server 0.1 seconds away
 OPEN_SECONDS, SEND_SECONDS, CLOSE_SECONDS = 20.0, 20.0, 20.0
+# After a signal: a batch system soon kills. The process that resumes sends the rows that the server lacks.
+STOP_SECONDS = 5.0
 OPEN_THREADS = 16
 OFFLINE = ("offline", "dryrun")  # modes of the package
 MAX_NAME, MAX_TAG = 128, 64  # characters that W&B accepts
@@ -97,7 +99,7 @@ class WandbRuns:
         wandb = _package()
         if "WANDB_SERVICE" not in os.environ:  # else it belongs to the caller of run.main
             self._package = wandb
-        mode = in_threads(_start, [wandb], 1, OPEN_SECONDS)[0]
+        mode = in_threads(lambda module: _start(module, self.folder), [wandb], 1, OPEN_SECONDS)[0]
         if mode == "disabled":
             self.close()
             return False
@@ -150,15 +152,17 @@ class WandbRuns:
     def close(self, exit_codes: Sequence[int] | None = None) -> None:
         """Ends the members' runs, each with its exit code, by default 1. W&B shows a run as failed unless it is 0."""
         runs, self._runs = self._runs, []
+        codes = exit_codes or [FAILED] * len(runs)
+        seconds = STOP_SECONDS if INTERRUPTED in codes else CLOSE_SECONDS
         try:
-            ends = list(zip(runs, exit_codes or [FAILED] * len(runs), strict=bool(runs)))
-            in_threads(lambda end: end[0].finish(exit_code=end[1]), ends, len(ends), CLOSE_SECONDS)
+            ends = list(zip(runs, codes, strict=bool(runs)))
+            in_threads(lambda end: end[0].finish(exit_code=end[1]), ends, len(ends), seconds)
         except Exception as error:
             self.warn(f"W&B may lack the last rows, evaluations.csv has them: {one_line(error)}")
         package, self._package = self._package, None
         if package:
             try:
-                in_threads(lambda module: module.teardown(), [package], 1, CLOSE_SECONDS / 4)
+                in_threads(lambda module: module.teardown(), [package], 1, STOP_SECONDS)
             except Exception:  # its process ends with this one
                 return
 
@@ -189,11 +193,19 @@ def _package() -> ModuleType:
     return wandb
 
 
-def _start(wandb: ModuleType) -> str:
+def _start(wandb: ModuleType, folder: Path) -> str:
     """Starts the package's process; returns the mode. Raises `Unavailable` if it would ask for a login."""
-    os.environ.setdefault("WANDB_ERROR_REPORTING", "false")  # its telemetry takes longer than the rows
-    started = "WANDB_SERVICE" in os.environ
-    mode: str = wandb.setup(None if started else _settings(wandb)).settings.mode
+    variables = {
+        "WANDB_ERROR_REPORTING": "false",  # telemetry, which takes longer than the rows
+        "WANDB_CACHE_DIR": str(folder),  # the process's log, else in the home folder
+    }
+    added = {name: text for name, text in variables.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        mode: str = wandb.setup(None if "WANDB_SERVICE" in os.environ else _settings(wandb)).settings.mode
+    finally:
+        for name in added:
+            os.environ.pop(name)
     if mode not in (*OFFLINE, "disabled") and wandb.run is None and not wandb.login(prompt=False, verify=False):
         raise Unavailable("no login; expects `wandb login`, WANDB_API_KEY, or WANDB_MODE=offline")
     return mode
