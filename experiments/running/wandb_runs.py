@@ -152,10 +152,9 @@ class WandbRuns:
     def close(self, exit_codes: Sequence[int] | None = None) -> None:
         """Ends the members' runs, each with its exit code, by default 1. W&B shows a run as failed unless it is 0."""
         runs, self._runs = self._runs, []
-        codes = exit_codes or [FAILED] * len(runs)
-        seconds = STOP_SECONDS if INTERRUPTED in codes else CLOSE_SECONDS
+        ends = [(run, exit_codes[index] if exit_codes else FAILED) for index, run in enumerate(runs)]
+        seconds = STOP_SECONDS if exit_codes and INTERRUPTED in exit_codes else CLOSE_SECONDS
         try:
-            ends = list(zip(runs, codes, strict=bool(runs)))
             in_threads(lambda end: end[0].finish(exit_code=end[1]), ends, len(ends), seconds)
         except Exception as error:
             self.warn(f"W&B may lack the last rows, evaluations.csv has them: {one_line(error)}")
