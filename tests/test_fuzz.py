@@ -16,7 +16,7 @@ from experiments.commandline.arguments import UsageError, printable
 from experiments.commandline.flag_table import FLAGS
 from experiments.grids.grid import GRIDS, make_cells
 from experiments.playing import play_flags
-from experiments.running import plan
+from experiments.running import memory, plan
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
 
@@ -101,8 +101,8 @@ def run(inputs: int, seed: int, folder, monkeypatch) -> int:
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.chdir(folder)
     monkeypatch.setattr(envs, "make", functools.cache(envs.make))
-    estimate = functools.cache(plan.memory_estimate)
-    monkeypatch.setattr(plan, "memory_estimate", estimate)
+    estimate = functools.cache(memory.memory_estimate)
+    monkeypatch.setattr(memory, "memory_estimate", estimate)
     draw, planned = random.Random(seed), 0
     for _ in range(inputs):
         argv = command_line(draw, folder)

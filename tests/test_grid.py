@@ -28,6 +28,7 @@ def test_tables_2_to_4_are_the_papers_nine_on_its_four_tasks():
 def test_a_cell_is_named_by_its_flags():
     assert run_name(["--steps=10", "--hidden=8,8", "--out=a/b"]) == "hidden=8,8_out=a-b_steps=10"
     assert run_name([]) == "default"
+    assert run_name(["--steps=10", "--wandb=mine"]) == run_name(["--steps=10", "--wandb"]) == "steps=10"
 
 
 def test_shortened_names_still_differ():

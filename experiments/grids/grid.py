@@ -165,7 +165,11 @@ def split_seeds(run_flags: Sequence[str], per_cell: int | None) -> list[tuple[st
 
 
 def run_name(run_flags: Sequence[str]) -> str:
-    """A run's name, made of its flags, so that grids share their runs. A long name ends in a hash of the flags."""
+    """A run's name, made of its flags, so that grids share their runs. A long name ends in a hash of the flags.
+
+    --wandb is left out: it may be added to runs that have begun.
+    """
+    run_flags = [word for word in run_flags if word.lstrip("-").split("=")[0] not in ("wandb", "nowandb")]
     name = "_".join(word.lstrip("-").replace("/", "-") for word in sorted(run_flags)) or "default"
     if len(name) <= MAX_NAME:
         return name
