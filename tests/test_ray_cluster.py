@@ -1,20 +1,19 @@
 """The Ray launcher: with a stand-in for the process that talks to Ray, and (slow) on a cluster of three nodes."""
 
-import csv
 import importlib.util
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import psutil
 import pytest
+from ray_nodes import ray_nodes, rows, runs_on, start_sweep, wait_for
 
 from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError
-from experiments.launchers import ray_cluster, tied
+from experiments.launchers import ray_cluster
 from experiments.launchers.cell import Cell, Ended, write_ended
 from experiments.launchers.ray_cluster import RayLauncher, driver_variables, forwarded_variables, make
 from experiments.launchers.ray_options import RayOptions
@@ -201,56 +200,24 @@ ENGINE = [
     pytest.mark.skipif(not importlib.util.find_spec("ray"), reason="Ray is not installed: pip install '.[ray]'"),
     pytest.mark.skipif(sys.platform != "linux", reason="cores of one's own and tied processes need Linux"),
 ]
-GRID = ["--algos=td3,td3_sqt,td3_sqt_tuple", "--tasks=hopper", "--physics=mujoco", "--seeds=0,1", "--split=seeds:1"]
-GRID += ["--steps=6000", "--warmup_steps=100", "--eval_every=2000", "--checkpoint_every=1000", "--eval_episodes=1"]
-GRID += ["--batch_size=8", "--hidden=8", "--quiet", "--notensorboard"]
-
-
-def start_sweep(out, *arguments, core=None, **variables):
-    """The process of a sweep, in a session of its own as in a terminal; on one core if `core` is given."""
-    pinned = [sys.executable, tied.__file__, str(os.getpid()), str(core)] if core is not None else []
-    # Little of a program's optimisation matters here, and most of the time is compilation.
-    quick = {"XLA_FLAGS": "--xla_backend_optimization_level=0", "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        [*pinned, sys.executable, "-m", "experiments.sweep", *GRID, f"--out={out}", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env=os.environ | quick | variables,
-    )
-
-
-def rows(out):
-    """All rows of all tables, without the times."""
-    found = {}
-    for table in out.glob("*/*/*/evaluations.csv"):
-        with table.open() as file:
-            content = [{k: v for k, v in row.items() if k != "wall_seconds"} for row in csv.DictReader(file)]
-        found[table.relative_to(out)] = content
-    return found
 
 
 @pytest.fixture
 def cluster(monkeypatch):
     """Two nodes with one CPU each, beside the head."""
-    from ray_nodes import ray_nodes
-
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with ray_nodes(2) as nodes:
         yield nodes
 
 
-def marked(test):
+def engine_test(test):
     for mark in ENGINE:
         test = mark(test)
     return test
 
 
-@marked
+@engine_test
 def test_a_grid_ends_the_same_after_a_killed_worker_a_lost_node_and_ctrl_c(tmp_path, cluster):
-    from ray_nodes import runs_on, wait_for
-
     cores = sorted(os.sched_getaffinity(0))
     plain = [start_sweep(tmp_path / "plain", f"--seeds={seed}", core=cores[seed % len(cores)]) for seed in (0, 1)]
     for sweep in plain:
@@ -291,10 +258,8 @@ def test_a_grid_ends_the_same_after_a_killed_worker_a_lost_node_and_ctrl_c(tmp_p
     assert not [*out.glob(".*")]
 
 
-@marked
+@engine_test
 def test_a_cluster_of_its_own_ends_with_the_sweep(tmp_path):
-    from ray_nodes import wait_for
-
     sweep = start_sweep(tmp_path / "out", "--launcher=ray", "--algos=td3")
     process = psutil.Process(sweep.pid)
 
@@ -308,7 +273,7 @@ def test_a_cluster_of_its_own_ends_with_the_sweep(tmp_path):
     wait_for(lambda: not any(child.is_running() and child.status() != psutil.STATUS_ZOMBIE for child in started), 180)
 
 
-@marked
+@engine_test
 @pytest.mark.parametrize(
     ("option", "address", "line"),
     [
