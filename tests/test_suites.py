@@ -23,7 +23,7 @@ def test_a_measurement_that_raises_is_a_failure_and_the_next_is_made(monkeypatch
 
 def test_every_suite_makes_its_measurements(monkeypatch):
     made = []
-    for name in ("env", "physics", "updates", "replay", "memory", "checkpoint", "loops"):
+    for name in ("env", "physics", "updates", "replay", "memory", "batches", "checkpoint", "loops"):
         monkeypatch.setattr(
             suites, f"bench_{name}", lambda *case, name=name, **timing: made.append((name, *case)) or []
         )
@@ -52,6 +52,8 @@ def test_every_suite_makes_its_measurements(monkeypatch):
         ("checkpoint", "td7", "ant", 5, 3),
         ("memory", "td3", "ant", 5, 10, "mjx"),
         ("memory", "td7", "ant", 5, 10, "mjx"),
+        ("batches", "td3", "ant", 5, "mjx"),
+        ("batches", "td7", "ant", 5, "mjx"),
         ("growth", ["td3", "td7"], "ant", 5),
         ("compare", "sbx", "td3", "ant", 5, ["mjx"], "python", {}),
     ]
