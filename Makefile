@@ -25,7 +25,7 @@ test: $(STAMP)  ## all tests except the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-engines: $(STAMP)  ## the tests that start SLURM or Ray
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,slurm,ray]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,ray]'
 	$(BIN)/python -m pytest -m engine tests/test_*_cluster.py
 
 test-all: $(STAMP)  ## all tests, compiled as users' programs are

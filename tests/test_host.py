@@ -200,6 +200,7 @@ def test_a_wait_that_ctrl_c_ends_does_not_give_its_result_to_the_next_call():
     thread, release = PlayingThread(), threading.Event()
 
     def late():
+        time.sleep(0.2)  # until the other thread waits: a signal just before would be seen after the wait
         os.kill(os.getpid(), signal.SIGINT)
         return release.wait(60)
 

@@ -8,9 +8,10 @@ import subprocess
 import sys
 import time
 
-import optuna
 import pytest
-from tuned_runs import contents
+
+optuna = pytest.importorskip("optuna", reason="needs the extra tune")
+from tuned_runs import contents  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
