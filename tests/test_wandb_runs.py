@@ -349,6 +349,7 @@ TINY = (
 
 
 @pytest.mark.usefixtures("shared_programs", "tiny_tasks")
+@pytest.mark.slow
 def test_a_run_and_its_resumption_send_each_row_once(tmp_path, wandb, capsys):
     def run(*arguments):
         assert main(["experiments.run", *TINY.split(), f"--out={tmp_path}", "--resume", *arguments]) == 0
