@@ -252,7 +252,7 @@ def test_a_grid_ends_the_same_after_a_killed_worker_a_lost_node_and_ctrl_c(tmp_p
         text, errors = sweep.communicate(timeout=240)
     assert sweep.returncode == DONE and not errors, text + errors
     assert rows(out) == rows(tmp_path / "plain")
-    for path in hit:  # none of them began anew
+    for path in hit:  # none of them began at step 0 again
         config = json.loads((path / "config.json").read_text())
         assert config["resumed"] and config["device"]["cores"] == 1
     assert not [*out.glob(".*")]

@@ -165,7 +165,7 @@ def test_fail_fast_cancels_the_others(tmp_path, fail_fast):
 
     launcher = OneByOne(one)
     code = train_cells(cells, launcher, lambda line: None, fail_fast=fail_fast)
-    assert (len(trained), launcher.cancels, code) == ((1, 1, INTERRUPTED) if fail_fast else (4, 0, FAILED))
+    assert (len(trained), launcher.cancels, code) == ((1, 1, FAILED) if fail_fast else (4, 0, FAILED))
 
 
 def test_signals_cancel_once_each_and_a_lost_cell_is_then_interrupted(tmp_path):

@@ -76,7 +76,9 @@ def train_cells(
                     say(line)
     for line in _failures(over):
         say(line)
-    return min((_exit_code(ended) for ended in over), key=WORST_FIRST.index, default=DONE)
+    # With `fail_fast`, the code is that of the failure, not of the runs that it stopped.
+    counted = [ended for ended in over if not (fail_fast and not signals() and ended.code == INTERRUPTED)] or over
+    return min((_exit_code(ended) for ended in counted), key=WORST_FIRST.index, default=DONE)
 
 
 def submit_and_leave(cells: Sequence[Cell], launcher: SlurmLauncher, say: Callable[[str], None]) -> int:

@@ -112,7 +112,7 @@ def open_file(path: Path, flags: int) -> int:
 def read(path: Path) -> tuple[bytes, float]:
     """The content of the file `lock`, and when it was written, by the clock of its file system (s since 1970).
 
-    Opens the file anew, so that what another host has written is seen (close-to-open consistency: man 5 nfs).
+    Opens the file each time, so that what another host has written is seen (close-to-open consistency: man 5 nfs).
 
     Raises:
       OSError: it cannot be read.

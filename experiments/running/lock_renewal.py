@@ -84,7 +84,7 @@ def _rewrite(path: Path, record: Record) -> Record | None:
 
     An empty or damaged record is replaced: no process leaves one.
     """
-    # Opened anew, so that what another host has written is seen, and a file that has replaced this one.
+    # Opened each time, so that what another host has written is seen, and a file that has replaced this one.
     descriptor = lock_record.open_file(path, os.O_RDWR)
     try:
         found = lock_record.decode(os.pread(descriptor, lock_record.RECORD_BYTES + 1, 0))

@@ -125,7 +125,7 @@ class WandbRuns:
         else:
             self._first = [run.starting_step for run in self._runs]
             self.where = f"W&B: the group {self._runs[0].group} of {self._runs[0].project_url}"
-            # The server gets the rows from the tables: `wandb sync` would number those of the files anew.
+            # The server gets the rows from the tables: `wandb sync` would number those of the files again.
             for file in self.folder.glob(f"{FOLDER}/offline-run-*-{self._sent.id}-*/*.wandb"):
                 file.with_name(f"{file.name}.synced").touch()
         return True

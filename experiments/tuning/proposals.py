@@ -1,6 +1,6 @@
 """The next trial of a study, as a function of the trials before it.
 
-Nothing else is remembered: the sampler of trial n is made anew, with a seed made of the study's seed and n. Therefore a
+Nothing else is remembered: each trial has a sampler of its own, with a seed made of the study's seed and n. Therefore a
 study that was killed and started again proposes what it would have proposed.
 """
 
