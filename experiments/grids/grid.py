@@ -72,15 +72,20 @@ def make_cells(
         tasks = [task if is_factory(task) else envs.resolve(task) for task in tasks]
     except ValueError as error:
         raise UsageError(f"--tasks: {error}") from None
-    for word in run_flags:
-        if not word.startswith("--") or word.lstrip("-").split("=")[0] in CELL_FLAGS:
-            raise UsageError(
-                f"{word}: expects flags of experiments.run in the form --flag=value, except --{', --'.join(CELL_FLAGS)}"
-            )
+    check_run_flags(run_flags, CELL_FLAGS)
     cells = cells_of(grid, algos, tasks, out, run_flags, seeds_per_cell)
     for cell in cells:  # before any of them starts
         flags.parse(["run", *cell.command])
     return cells
+
+
+def check_run_flags(run_flags: Sequence[str], own: Sequence[str]) -> None:
+    """Raises `UsageError` if a word is not a flag with its value, or is one of `own`, which the command sets."""
+    for word in run_flags:
+        if not word.startswith("--") or word.lstrip("-").split("=")[0] in own:
+            raise UsageError(
+                f"{word}: expects flags of experiments.run in the form --flag=value, except --{', --'.join(own)}"
+            )
 
 
 def _find_grid(name: str | None, algos: Sequence[str], tasks: Sequence[str]) -> Grid:

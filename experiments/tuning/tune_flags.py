@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from experiments.commandline import flags
 from experiments.commandline.arguments import UsageError
 from experiments.evidence.variants import baseline_of
-from experiments.grids.grid import CELL_FLAGS
+from experiments.grids.grid import CELL_FLAGS, check_run_flags
 from experiments.tuning.space import Axis, axes_of, check_no_flags, grid_size, parse_space
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
@@ -111,11 +111,7 @@ def check_flags(given: Given, run_flags: Sequence[str]) -> Options:
     for name, value, choices in (("sampler", given.sampler, SAMPLERS), ("objective", given.objective, OBJECTIVES)):
         if value not in choices:
             raise UsageError(f"--{name}: {expects_one_of(value, choices)}")
-    for word in run_flags:
-        if not word.startswith("--") or word.lstrip("-").split("=")[0] in OWN_FLAGS:
-            raise UsageError(
-                f"{word}: expects flags of experiments.run in the form --flag=value, except --{', --'.join(OWN_FLAGS)}"
-            )
+    check_run_flags(run_flags, OWN_FLAGS)
     axes = parse_space(given.space, given.algo)
     if given.sampler == "grid" and grid_size(axes) is None:
         name = next(axis.name for axis in axes if not axis.values)
