@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from experiments.commandline.arguments import INTERRUPTED
@@ -46,6 +46,18 @@ class Requests:
 
 
 @contextmanager
+def handling(numbers: Sequence[int], handle: Callable[[int], None]) -> Iterator[None]:
+    """Calls `handle` with the number of each of these signals; afterwards the handlers are the old ones."""
+    before = {number: signal.signal(number, lambda number, _: handle(number)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # it was not installed from Python
+                signal.signal(number, handler)
+
+
+@contextmanager
 def stop_on_signal() -> Iterator[list[int]]:
     """Collects the signals in the list that it yields; a second SIGINT or SIGTERM ends the process at once.
 
@@ -62,13 +74,10 @@ def stop_on_signal() -> Iterator[list[int]]:
     watcher = threading.Thread(target=_watch, args=(reader, handled), daemon=True, name="signals")
     watcher.start()
     before_fd = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # gets the number of each signal as a byte
-    before = {number: signal.signal(number, lambda number, _: received.append(number)) for number in handled}
     try:
-        yield received
+        with handling(handled, received.append):
+            yield received
     finally:
-        for number, handler in before.items():
-            if handler is not None:  # it was not installed from Python
-                signal.signal(number, handler)
         signal.set_wakeup_fd(before_fd)
         os.close(writer)
         watcher.join()
