@@ -61,11 +61,11 @@ class CellJob(NamedTuple):
         except slurm_queue.CommandError as error:
             print(f"the job keeps its name: {error}", file=sys.stderr)
         process = CellProcess(self.cell, variables={"SQT_JOB": f"slurm {job.id}"})
-        ended, told = None, 0
+        ended, forwarded = None, 0
         while ended is None:
             ended = process.wait(POLL_SECONDS)
-            while ended is None and told < len(received):
-                number, told = received[told], told + 1
+            while ended is None and forwarded < len(received):
+                number, forwarded = received[forwarded], forwarded + 1
                 print(f"{signal.Signals(number).name} received", file=sys.stderr, flush=True)
                 if number in (*STOP, *SAVE):
                     # The run may have got the signal from SLURM too, or not: that depends on the cluster. As SIGUSR1

@@ -79,7 +79,7 @@ def variables_of_no_job() -> Iterator[None]:
 
 
 def parameters(submission: Submission, cells: Sequence[Cell]) -> dict[str, Any]:
-    """What submitit's `SlurmExecutor` is told."""
+    """What submitit's `SlurmExecutor` gets."""
     options = submission.options
     return {
         "job_name": f"{cells[0].algo}-{cells[0].task}" if len(cells) == 1 else "sqt_jax",

@@ -168,7 +168,7 @@ def _flock(descriptor: int, folder: Path, warn: Callable[[str], None]) -> bool |
 def _await_flock(descriptor: int, path: Path, own: Record, timing: Timing, warn: Callable[[str], None]) -> None:
     """Returns with the lock that an earlier attempt at the same job has not given up yet. Raises `Busy`."""
     ends = time.monotonic() + timing.wait
-    told = False
+    warned = False
     while True:
         try:
             found = lock_record.decode(lock_record.read(path)[0])
@@ -176,9 +176,9 @@ def _await_flock(descriptor: int, path: Path, own: Record, timing: Timing, warn:
             found = None
         if not own.succeeds(found) or time.monotonic() > ends:
             raise Busy(found)
-        if not told:
+        if not warned:
             warn(f"{found}, an earlier attempt at this job, still has the lock: waiting up to {timing.wait:g} s")
-            told = True
+            warned = True
         time.sleep(timing.expires / LOOKS)
         if _flock(descriptor, path.parent, warn):
             return

@@ -67,7 +67,7 @@ def run_study(
     """
     pace.passed((len(study.trials) - len(study.running)) * len(plan.seeds), trained=False)
 
-    def told(ended: Ended) -> None:
+    def tell_ended(ended: Ended) -> None:
         if ended.code in (DONE, DIVERGED):
             batch = next(batch for batch in batches().values() if batch.cell == ended.cell)
             tell_batch(study, batch, plan.objective)
@@ -89,7 +89,7 @@ def run_study(
         running = {trial.number for trial in study.running}
         todo = [batch.cell for batch in batches().values() if running & {trial.number for trial in batch.trials}]
         if todo:
-            code = train(todo, told)
+            code = train(todo, tell_ended)
             if code not in (DONE, DIVERGED):
                 return code
         elif len(study.trials) >= plan.trials:
@@ -107,13 +107,13 @@ def tell_batch(study: Study, batch: Batch, objective: str) -> None:
 
 def tell_repeated(study: Study) -> int:
     """Gives trials with the values of an earlier one its result; returns how many."""
-    told = 0
+    count = 0
     for trial in study.running:
         same = attribute(trial, SAME_AS)
         if same is not None and (result := study.result(same)):
             study.tell(trial, result)
-            told += 1
-    return told
+            count += 1
+    return count
 
 
 def batch_text(study: Study, batch: Batch) -> str:
