@@ -1,4 +1,8 @@
-"""Conditions that stay real branches under `vmap`: `cond_if_any` and `any_in_batch`."""
+"""Conditions that stay real branches under `vmap`, without copies of what they change.
+
+A branch is a loop of one iteration or none. XLA writes a loop's state in place; a conditional copies all that its
+branches return, also where nothing changes.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +16,33 @@ from sqt_jax.types import Array
 Branch = Callable[[Any, Any], Any]  # (old, given) -> a tree like old
 
 
+def apply_if(predicate: Array, function: Callable[[Any], Any], state: Any) -> Any:
+    """`function(state)` if `predicate` holds, else `state`.
+
+    Under `vmap` the predicate must be shared by all entries, else both are computed for all. Only forward derivatives
+    are supported.
+
+    Args:
+      predicate: [] bool.
+      function: returns a tree with the structure, shapes and dtypes of `state`.
+    """
+
+    def once(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        return jnp.zeros((), bool), function(carry[1])
+
+    return jax.lax.while_loop(lambda carry: carry[0], once, (jnp.asarray(predicate), state))[1]
+
+
+def apply_every(period: int, step: Array, function: Callable[[Any], Any], state: Any) -> Any:
+    """`function(state)` at the updates `period`, 2 × `period` and so on, else `state`.
+
+    Args:
+      step: [] int32, the number of updates done before; members share it.
+      function: as in `apply_if`.
+    """
+    return function(state) if period == 1 else apply_if((step + 1) % period == 0, function, state)
+
+
 def cond_if_any(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) -> Any:
     """`branch(old, given)` if `predicate` holds, else `old`; under `vmap` the branch runs only if any entry needs it.
 
@@ -19,7 +50,7 @@ def cond_if_any(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) 
     branch only if the predicate holds for at least one batch entry, and copies nothing if it holds for none. Entries
     for which it does not hold keep `old`. Use it for updates that are rare and expensive, like the start of an episode.
 
-    Only forward derivatives (`jax.jvp`) are supported: JAX cannot transpose a function with a custom batching rule.
+    Only forward derivatives (`jax.jvp`) are supported.
 
     Args:
       predicate: [] bool.
@@ -43,7 +74,7 @@ def _if_any(select: Callable) -> Callable:
 
     @custom_vmap
     def call(predicate: Array, old: Any, given: Any) -> Any:
-        return jax.lax.cond(jnp.any(predicate), select, lambda predicate, old, given: old, predicate, old, given)
+        return apply_if(jnp.any(predicate), lambda old: select(predicate, old, given), old)
 
     @call.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:

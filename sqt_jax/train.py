@@ -5,14 +5,15 @@ storage, environments and keys get a member axis. The counters do not, so condit
 `vmap`; with a batched condition both branches would be computed.
 """
 
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from sqt_jax import rollout
-from sqt_jax.conditional import any_in_batch
+from sqt_jax.conditional import any_in_batch, apply_if
 from sqt_jax.config import TrainConfig
 from sqt_jax.evaluate import Evaluation, evaluate_with_bias
 from sqt_jax.members import Layout, every_leaf
@@ -65,7 +66,7 @@ class Trainer(NamedTuple):
     """Training of one member."""
 
     init: Callable[..., TrainState]  # (key, scalars=None) -> state
-    advance: Callable[[TrainState, Any, Any], TrainState]  # (state, num_steps, learn)
+    advance: Callable[..., TrainState]  # (state, num_steps, learn: bool)
     evaluate: Callable[[TrainState], tuple[Evaluation, Metrics]]  # with the bias of the critics' values
     measure: Callable[[TrainState], Metrics]  # means over the interval, and the status at its end
     restart: Callable[[TrainState], TrainState]  # a restored state -> the state to continue with
@@ -123,24 +124,22 @@ def make_trainer(
         """A key for this purpose at this step of this member only."""
         return jax.random.fold_in(jax.random.fold_in(state.key, purpose), state.env_steps)
 
-    def step(state: TrainState, learn: Array) -> TrainState:
+    def step(state: TrainState, learn: bool) -> TrainState:
         act_key, warmup_key, update_key = jax.random.split(key_for(TRAINING, state), 3)
 
         def behaviour(obs):
-            uniform = rollout.uniform_actions(warmup_key, num_envs, env.action_size)
-            seen = agent.see(state.agent, obs)  # kept by `learn_from`: the step may fail
-            return jnp.where(learn, agent.act(seen, obs, act_key), uniform)
+            if not learn:
+                return rollout.uniform_actions(warmup_key, num_envs, env.action_size)
+            return agent.act(agent.see(state.agent, obs), obs, act_key)  # `learn_from` keeps it: the step may fail
 
         timestep, transition = rollout.step(env, state.timestep, behaviour)
 
         if env.host is None:
             return learn_from(state, timestep, transition, learn, update_key)
-        # Nothing of a step that failed is stored or learned: a loop of no or one iteration, because a conditional
-        # would copy the replay.
-        return jax.lax.fori_loop(
-            0,
-            jnp.where(failed(timestep), 0, 1),
-            lambda _, state: learn_from(state, timestep, transition, learn, update_key),
+        # Nothing of a step that failed is stored or learned.
+        return apply_if(
+            ~failed(timestep),
+            lambda state: learn_from(state, timestep, transition, learn, update_key),
             state._replace(timestep=timestep),
         )
 
@@ -150,7 +149,7 @@ def make_trainer(
         return any_in_batch(jnp.any(jax.vmap(env.host.failed)(timestep)))
 
     def learn_from(
-        state: TrainState, timestep: TimeStep, transition: Transition, learn: Array, update_key: Array
+        state: TrainState, timestep: TimeStep, transition: Transition, learn: bool, update_key: Array
     ) -> TrainState:
         """The state after a step of the environments: the transitions stored, the updates done."""
         over = timestep.terminated | timestep.truncated
@@ -171,10 +170,11 @@ def make_trainer(
             replay_state = replay.feedback(replay_state, rows, td_error, step + 1)
             return agent_state, replay_state, means.add(metrics)
 
-        # The warm-up has no updates: a loop of 0 iterations, so that warm-up and training are one compiled program.
-        count = jnp.where(learn, updates, 0)
+        count = updates if learn else 0
         carry = (agent_state, replay_state, state.means)
-        agent_state, replay_state, means = jax.lax.fori_loop(0, count, update, carry)
+        # A loop of one update would cost a GPU two questions to the host.
+        carry = update(0, carry) if count == 1 else jax.lax.fori_loop(0, count, update, carry)
+        agent_state, replay_state, means = carry
         env_steps = state.env_steps + num_envs
         diverges_now = agent_state.diverged & (state.diverged_at < 0)
         return TrainState(
@@ -189,13 +189,12 @@ def make_trainer(
             means=means,
         )
 
-    def advance(state: TrainState, num_steps: Array | int, learn: Array | bool) -> TrainState:
+    def advance(state: TrainState, num_steps: Array | int, learn: bool) -> TrainState:
         """`num_steps` lockstep steps, each of E transitions; without `learn`, random actions and no updates.
 
-        Both may be traced. One call of n + m steps gives the same bits as calls of n and m steps. It returns earlier if
-        an environment on the host fails.
+        `num_steps` may be traced. One call of n + m steps gives the same bits as calls of n and m steps. It returns
+        earlier if an environment on the host fails.
         """
-        learn = jnp.asarray(learn)
         if env.host is None:
             return jax.lax.fori_loop(0, num_steps, lambda _, state: step(state, learn), state)
         return jax.lax.while_loop(
@@ -268,7 +267,7 @@ def member_axes(replay: Replay) -> TrainState:
 
 
 def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
-    """Compiles a trainer over members; each function compiles once, whatever the number of steps.
+    """Compiles a trainer over members: two programs for `advance` (warm-up, training), one for each other function.
 
     Args:
       layout: the members and their devices; None is any number of members on the default device.
@@ -277,9 +276,14 @@ def make_sweep(trainer: Trainer, layout: Layout | None = None) -> Sweep:
     layout = layout or Layout(1)
 
     init = layout.over_members(trainer.init, (0, 0), axes)
+
+    def advance(state: TrainState, num_steps: Array | int, learn: bool) -> TrainState:
+        advance_member = functools.partial(trainer.advance, learn=learn)
+        return layout.over_members(advance_member, (axes, None), axes)(state, num_steps)
+
     return Sweep(
         init=jax.jit(lambda *arguments: init(*jax.tree.map(layout.padded, arguments))),
-        advance=jax.jit(layout.over_members(trainer.advance, (axes, None, None), axes), donate_argnums=0),
+        advance=jax.jit(advance, donate_argnums=0, static_argnums=2),
         evaluate=jax.jit(layout.over_members(trainer.evaluate, (axes,), 0)),
         measure=jax.jit(layout.over_members(trainer.measure, (axes,), 0)),
         restart=jax.jit(layout.over_members(trainer.restart, (axes,), axes), donate_argnums=0),
@@ -317,11 +321,10 @@ def make_train(trainer: Trainer, config: TrainConfig) -> Callable[..., tuple[Tra
         counts.append([parts.get(False, 0), parts.get(True, 0)])
 
     def train(key: Array, scalars: Scalars | None = None) -> tuple[TrainState, History]:
-        def phase(state, count_and_learn):
-            return trainer.advance(state, *count_and_learn), None
-
         def interval(state, count):
-            state, _ = jax.lax.scan(phase, new_interval(state), (count, jnp.array([False, True])))
+            warmup, training = count
+            state = trainer.advance(new_interval(state), warmup, learn=False)
+            state = trainer.advance(state, training, learn=True)
             evaluation, bias = trainer.evaluate(state)
             return state, (state.env_steps, evaluation, trainer.measure(state) | bias)
 

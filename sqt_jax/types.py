@@ -17,6 +17,11 @@ State = Any  # a pytree of arrays that only its owner reads
 Metrics = dict[str, Array]  # scalars by name
 
 
+def not_measured() -> Array:
+    """The value of a metric that an update did not measure: NaN, [] float32."""
+    return jnp.full((), jnp.nan)
+
+
 class Transition(NamedTuple):
     """One environment step, or a batch of them with leading axes.
 

@@ -61,8 +61,8 @@ def test_unbatched_arguments_are_shared():
     )
 
 
-def test_the_compiled_loop_has_a_real_branch():
-    """One conditional, and no select of the state outside."""
+def test_the_compiled_loop_has_a_real_branch_that_copies_nothing():
+    """A loop in the loop, and no select or copy of the state outside."""
 
     def loop(old, given):
         def body(i, old):
@@ -72,10 +72,10 @@ def test_the_compiled_loop_has_a_real_branch():
 
     _, old, given = arguments(4, 3)
     text = jax.jit(loop).lower(old, given).compile().as_text()
-    assert len(re.findall(r" conditional\(", text)) == 1
-    # In the loop itself only the conditional's result and its forwarding have the state's shape.
-    body = next(part for part in text.split("\n\n") if " conditional(" in part)
-    kinds = set(re.findall(r"= f32\[4,3,3\]\S* ([\w-]+)\(", body))
+    assert len(re.findall(r" while\(", text)) == 2 and " conditional(" not in text
+    # In the outer loop's body only the branch's result and its forwarding have the state's shape.
+    around = [part for part in text.split("\n\n") if " while(" in part and "ENTRY" not in part]
+    kinds = set(re.findall(r"= f32\[4,3,3\]\S* ([\w-]+)\(", "".join(around)))
     assert kinds <= {"get-tuple-element", "parameter"}, kinds
 
 

@@ -107,6 +107,7 @@ def test_chunks_end_at_the_warm_up_and_follow_the_speed():
     assert sum(steps for steps, learn in recorder.calls if not learn) == 750
     assert sum(steps for steps, learn in recorder.calls if learn) == 1_250
     assert recorder.calls[1:3] == [(10, False), (200, False)]  # 100 steps a second, two seconds a chunk
+    assert next(steps for steps, learn in recorder.calls if learn) == 1  # compiles too
     assert max(steps for steps, _ in recorder.calls) == 200
     assert int(recorder.reports[-1].gradient_steps) == 1_250
 
@@ -129,8 +130,8 @@ def test_phases_and_time_left_are_shown():
     recorder = Recorder(TRAIN)
     recorder.run()
     phases = [status.phase for status in recorder.statuses]
-    assert phases[:3] == ["compiling the evaluation", "compiling the training", "warm-up"]
-    assert {"training", "evaluating"} <= set(phases)
+    assert phases[:3] == ["compiling the evaluation", "compiling the warm-up", "warm-up"]
+    assert {"compiling the training", "training", "evaluating"} <= set(phases)
     last = recorder.statuses[-1]
     assert last.phase == "evaluating" and last.env_steps == 2_000
     assert last.left == (pytest.approx(0.5), False)  # the last evaluation itself

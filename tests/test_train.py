@@ -120,13 +120,13 @@ def test_a_final_observation_is_kept_for_each_episode_and_no_other_step(task, ph
     assert np.all(metrics["train_episodes"] >= 1) and np.all(metrics["replay_rows"] == 1_020)
 
 
-def test_any_number_of_steps_and_the_warmup_share_one_compilation(td3):
+def test_any_number_of_steps_shares_one_compilation_of_the_warmup_and_one_of_training(td3):
     config, _, sweep = make.__wrapped__("td3")
     state = start(config, sweep)
     for steps, learn in [(7, False), (1, False), (5, True), (11, True)]:
         state, _ = advance(sweep, state, steps, learn)
         sweep.evaluate(state)
-    assert sweep.advance._cache_size() == 1 and sweep.evaluate._cache_size() == 1
+    assert sweep.advance._cache_size() == 2 and sweep.evaluate._cache_size() == 1
 
 
 def test_a_sweep_over_scalars_shares_one_compilation():
@@ -301,7 +301,9 @@ def test_memory_estimate_is_the_size_of_replay_and_agents():
 
 def optimised(sweep, state):
     """The sweep compiled for speed, for tests that train for long (conftest: by default tests compile quickly)."""
-    return sweep._replace(advance=sweep.advance.lower(state, 1, True).compile({"xla_backend_optimization_level": 3}))
+    options = {"xla_backend_optimization_level": 3}
+    programs = {learn: sweep.advance.lower(state, 1, learn).compile(options) for learn in (False, True)}
+    return sweep._replace(advance=lambda state, steps, learn: programs[learn](state, steps))
 
 
 LEARN = {

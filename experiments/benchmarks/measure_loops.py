@@ -77,9 +77,10 @@ def loop_steps(algo: str, task: str, members: int, physics: str, devices: int = 
     scalars = jax.tree.map(lambda value: jnp.full(members, value), config.agent.scalars())
     state = sweep.init(member_keys(members), scalars)
     start = time.perf_counter()
-    state = jax.block_until_ready(sweep.advance(state, 1, False))
+    state = sweep.advance(state, 1, False)
+    state = jax.block_until_ready(sweep.advance(state, 1, True))
     compile_seconds = time.perf_counter() - start
-    state = sweep.advance(state, WARMUP_STEPS - 1, False)
+    state = sweep.advance(state, WARMUP_STEPS, False)
 
     def once(steps: int) -> Array:
         nonlocal state

@@ -60,7 +60,7 @@ class Pace:
     """
 
     def __init__(self) -> None:
-        self.compiled = False
+        self.compiled: set[bool] = set()  # the programs that have run: warm-up, training
         self.rates: dict[bool, float] = {}  # lockstep steps per second, running mean
         self.steps = 0  # lockstep steps timed so far
         self.train_seconds = 0.0  # for these steps
@@ -69,18 +69,18 @@ class Pace:
 
     def chunk(self, learn: bool, limit: int) -> int:
         """Lockstep steps of the next call: about `CHUNK_SECONDS`; one if the call has to compile."""
-        if not self.compiled:
+        if learn not in self.compiled:
             return 1
         rate = self.rates.get(learn)
         return min(limit, 10 if rate is None else max(1, int(rate * CHUNK_SECONDS)))
 
     def advanced(self, learn: bool, steps: int, seconds: float) -> None:
-        if self.compiled:
+        if learn in self.compiled:
             rate = steps / max(seconds, 1e-9)
             self.rates[learn] = 0.7 * self.rates.get(learn, rate) + 0.3 * rate  # smooth enough to read
             self.steps += steps
             self.train_seconds += seconds
-        self.compiled = True
+        self.compiled.add(learn)
 
     def evaluated(self, seconds: float) -> None:
         if self.evaluations:
@@ -226,7 +226,8 @@ def train_loop(
             learn = done >= train.warmup_steps
             end = point if learn else min(point, train.warmup_steps)
             steps = pace.chunk(learn, (end - done) // train.num_envs)
-            show(("training" if learn else "warm-up") if pace.compiled else "compiling the training", learn)
+            phase = "training" if learn else "warm-up"
+            show(phase if learn in pace.compiled else f"compiling the {phase}", learn)
             before = clock()
             state = sweep.advance(state, steps, learn)
             jax.block_until_ready(state.env_steps)

@@ -13,10 +13,11 @@ import optax
 
 from sqt_jax import networks, q_targets
 from sqt_jax.agents import critic as critics
+from sqt_jax.conditional import apply_every
 from sqt_jax.config import AgentConfig
 from sqt_jax.gaussian import gaussian_actor
 from sqt_jax.optimizers import adam_init, adam_step, soft_update
-from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble, not_measured
 
 
 class SACState(NamedTuple):
@@ -128,11 +129,11 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
     def update(state: SACState, batch: Transition, draws: SACDraws, step: Array) -> tuple[SACState, Array, Metrics]:
         state, td_error, metrics = update_critic(state, batch, draws)
 
-        def skip(state, batch, draws):
-            return state, dict.fromkeys(("actor_loss", "entropy", "temperature"), jnp.full((), jnp.nan))  # not measured
+        def delayed(state_and_metrics):
+            return update_actor(state_and_metrics[0], batch, draws)
 
-        actor_due = (step + 1) % config.policy_delay == 0  # members share it: a real branch under vmap
-        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, draws)
+        skipped = dict.fromkeys(("actor_loss", "entropy", "temperature"), not_measured())
+        state, actor_metrics = apply_every(config.policy_delay, step, delayed, (state, skipped))
         target_critic = soft_update(state.target_critic, state.critic, state.scalars.tau, state.diverged)
         return state._replace(target_critic=target_critic), td_error, metrics | actor_metrics
 

@@ -12,9 +12,10 @@ import optax
 
 from sqt_jax import networks, q_targets
 from sqt_jax.agents import critic as critics
+from sqt_jax.conditional import apply_every
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step, soft_update
-from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble, not_measured
 
 
 class TD3State(NamedTuple):
@@ -104,12 +105,11 @@ def build(config: AgentConfig, observation_size: int, action_size: int) -> Parts
     def update(state: TD3State, batch: Transition, draws: TD3Draws, step: Array) -> tuple[TD3State, Array, Metrics]:
         state, td_error, metrics = update_critic(state, batch, draws)
 
-        def delayed(state):
-            state, actor_loss = update_actor(state, batch)
+        def delayed(state_and_loss):
+            state, actor_loss = update_actor(state_and_loss[0], batch)
             return update_targets(state), actor_loss
 
-        actor_due = (step + 1) % config.policy_delay == 0  # members share it: a real branch under vmap
-        state, actor_loss = jax.lax.cond(actor_due, delayed, lambda state: (state, jnp.nan), state)
+        state, actor_loss = apply_every(config.policy_delay, step, delayed, (state, not_measured()))
         return state, td_error, metrics | {"actor_loss": actor_loss}
 
     views = Views(

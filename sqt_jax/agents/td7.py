@@ -16,9 +16,10 @@ import optax
 from sqt_jax import q_targets, sale, trees
 from sqt_jax.agents import critic as critics
 from sqt_jax.agents import normalised, policy_checkpoints, td3
+from sqt_jax.conditional import apply_every
 from sqt_jax.config import AgentConfig
 from sqt_jax.optimizers import adam_init, adam_step
-from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble
+from sqt_jax.types import Array, Metrics, Params, Parts, Scalars, Transition, Views, assemble, not_measured
 
 UNBOUNDED = 1e30  # far beyond `critic.LARGEST_VALUE`, and finite
 
@@ -240,15 +241,12 @@ def build_learner(
         zs = encoder_net.zs(state.fixed_encoder, batch.obs)
         state, td_error, metrics = update_critic(state, batch, zs, draws)
 
-        def skip(state, *inputs):
-            actor_metrics = jax.eval_shape(update_actor, state, *inputs)[1]
-            return state, dict.fromkeys(actor_metrics, jnp.full((), jnp.nan))  # not measured
+        def delayed(state_and_metrics):
+            return update_actor(state_and_metrics[0], batch, zs, draws)
 
-        # Members share both conditions: real branches under vmap.
-        actor_due = (step + 1) % config.policy_delay == 0
-        copy_due = (step + 1) % config.target_update_period == 0
-        state, actor_metrics = jax.lax.cond(actor_due, update_actor, skip, state, batch, zs, draws)
-        state = jax.lax.cond(copy_due, copy_targets, lambda state: state, state)
+        skipped = dict.fromkeys(jax.eval_shape(update_actor, state, batch, zs, draws)[1], not_measured())
+        state, actor_metrics = apply_every(config.policy_delay, step, delayed, (state, skipped))
+        state = apply_every(config.target_update_period, step, copy_targets, state)
         return state, td_error, metrics | actor_metrics | encoder_metrics
 
     def q_values(state: TD7State, obs: Array, action: Array) -> Array:

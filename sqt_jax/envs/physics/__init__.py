@@ -54,7 +54,7 @@ QUANTITIES = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 PHYSICS = {
     "mjx": "sqt_jax.envs.physics.mjx",
     "mujoco": "sqt_jax.envs.physics.mujoco_c",
-    "warp": "sqt_jax.envs.physics.mjx_warp",
+    "warp": "sqt_jax.envs.physics.mujoco_warp",
 }
 
 
