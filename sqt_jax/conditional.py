@@ -40,7 +40,10 @@ def apply_every(period: int, step: Array, function: Callable[[Any], Any], state:
       step: [] int32, the number of updates done before; members share it.
       function: as in `apply_if`.
     """
-    return function(state) if period == 1 else apply_if((step + 1) % period == 0, function, state)
+    if period == 1:
+        return function(state)
+    with jax.named_scope(f"every_{period}_updates"):
+        return apply_if((step + 1) % period == 0, function, state)
 
 
 def cond_if_any(predicate: Array, branch: Branch, old: Any, *, given: Any = ()) -> Any:

@@ -77,8 +77,10 @@ def step(env: Environment, timestep: TimeStep, policy: Policy) -> tuple[TimeStep
     Returns:
       The next time steps, and the transitions for the replay: [E, ...] each.
     """
-    action = policy(timestep.obs)
-    following = jax.vmap(env.step)(timestep, action)
+    with jax.named_scope("act"):
+        action = policy(timestep.obs)
+    with jax.named_scope("environment"):
+        following = jax.vmap(env.step)(timestep, action)
     transition = Transition(
         obs=timestep.obs,
         action=action,

@@ -157,18 +157,24 @@ def make_trainer(
         # An episode that began in the warm-up has random actions in it: its return is not the policy's.
         begun = state.env_steps - num_envs * state.episodes.running_length.astype(jnp.int32)
         ended = over & learn & (begun >= config.warmup_steps)
-        agent_state = agent.see(state.agent, transition.obs)
-        agent_state = agent.observe(agent_state, episode_return, ended, state.gradient_steps)
-        replay_state = replay.insert(state.replay, transition)
+        with jax.named_scope("observe"):
+            agent_state = agent.see(state.agent, transition.obs)
+            agent_state = agent.observe(agent_state, episode_return, ended, state.gradient_steps)
+        with jax.named_scope("insert"):
+            replay_state = replay.insert(state.replay, transition)
 
         def update(i, carry):
             agent_state, replay_state, means = carry
             step = state.gradient_steps + i
             sample_key, noise_key = jax.random.split(jax.random.fold_in(update_key, i))
-            batch, rows = replay.sample(replay_state, sample_key)
-            agent_state, td_error, metrics = agent.update(agent_state, batch, noise_key, step)
-            replay_state = replay.feedback(replay_state, rows, td_error, step + 1)
-            return agent_state, replay_state, means.add(metrics)
+            with jax.named_scope("sample"):
+                batch, rows = replay.sample(replay_state, sample_key)
+            with jax.named_scope("update"):
+                agent_state, td_error, metrics = agent.update(agent_state, batch, noise_key, step)
+            with jax.named_scope("feedback"):
+                replay_state = replay.feedback(replay_state, rows, td_error, step + 1)
+            with jax.named_scope("metrics"):
+                return agent_state, replay_state, means.add(metrics)
 
         count = updates if learn else 0
         carry = (agent_state, replay_state, state.means)

@@ -6,13 +6,14 @@ Each function that checks exits with one line that names the flag and what it ex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jax
 from absl import flags
 
-from experiments.benchmarks import compare, growth
+from experiments.benchmarks import compare, gpu_target, growth, measure_kernels
 from experiments.benchmarks.suites import MORE_SUITES, SUITES, Request
 from experiments.commandline import arguments
 from experiments.commandline.path_flags import define_path
@@ -44,11 +45,12 @@ flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay and gro
 flags.DEFINE_list(
     "physics",
     None,
-    "Physics of the suites env, loop, memory and batches. Default: every physics that can run on this machine.",
+    "Physics of the suites env, loop, memory, batches and kernels. Default: every physics that can run on this machine "
+    "(kernels, which needs no GPU: mjx and warp).",
 )
 flags.DEFINE_list("solver", [], "More limits of MJX's solver for the suite physics: iterations/line-search steps.")
 flags.DEFINE_list(
-    "algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop, checkpoint, memory and batches."
+    "algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop, checkpoint, memory, batches and kernels."
 )
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list(
@@ -93,6 +95,8 @@ def check_flags() -> None:
     solver_limits()
     if "growth" in FLAGS.suites and len(FLAGS.members) != 1:
         sys.exit(f"--members: expects one number with the suite growth, not {','.join(FLAGS.members)}")
+    if "kernels" in FLAGS.suites:
+        check_kernels()
     if FLAGS.json and (Path(FLAGS.json).is_dir() or not Path(FLAGS.json).absolute().parent.is_dir()):
         sys.exit(f"--json: expects a file in an existing folder, not {FLAGS.json!r}")
     if "growth" in FLAGS.suites:
@@ -103,6 +107,15 @@ def check_flags() -> None:
             sys.exit(f"--algos: expects some of {', '.join(compare.ALGORITHMS[peer])} with --compare={peer}")
         if compare.lacks(peer, FLAGS.peer_python):
             sys.exit(f"--compare: {peer} needs a Python with {compare.INSTALL[peer]}; --peer_python names it")
+
+
+def check_kernels() -> None:
+    """Checks what the suite kernels needs: JAX's CUDA plugin, and physics that do not call the host."""
+    if gpu_target.lacks_plugin():
+        sys.exit("--suites: kernels expects JAX's CUDA plugin (no GPU is needed): pip install -e '.[kernels]'")
+    for name in FLAGS.physics or ():
+        if name not in measure_kernels.PHYSICS:
+            sys.exit(f"--physics: expects some of {', '.join(measure_kernels.PHYSICS)} with kernels, not {name!r}")
 
 
 @contextmanager
@@ -126,11 +139,18 @@ def solver_limits() -> dict[str, dict[str, int]]:
 
 
 def physics_here() -> list[str]:
-    """--physics, by default every physics that can run on this machine."""
+    """--physics, by default every physics that can run on this machine; none if no suite runs one."""
+    if FLAGS.suites == ["kernels"] and not FLAGS.compare:
+        return []
     for name in FLAGS.physics or ():
         if missing := envs.lacks(name):
             sys.exit(f"--physics: {name} needs {missing}")
     return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
+
+
+def installed(physics: str) -> bool:
+    """Whether the packages of a physics are installed, whatever the machine."""
+    return physics != "warp" or find_spec("warp") is not None
 
 
 def devices_here() -> list[int | None]:
@@ -159,6 +179,7 @@ def request() -> Request:
         tasks=FLAGS.tasks,
         algos=FLAGS.algos,
         physics=physics_here(),
+        compiled_physics=FLAGS.physics or [name for name in measure_kernels.PHYSICS if installed(name)],
         solver=solver_limits(),
         members=[int(value) for value in FLAGS.members],
         devices=devices_here(),

@@ -17,6 +17,9 @@ from sqt_jax.members import usable_devices
 from sqt_jax.types import Array
 
 MEGABYTES = "MB"
+KERNELS = "kernels per step"
+QUESTIONS = "questions to the host per step"
+AMOUNTS = (MEGABYTES, KERNELS, QUESTIONS)  # units of a figure that is not a rate
 PROFILED_STEPS = 4  # lockstep steps; the actor learns in half of them
 
 
@@ -37,9 +40,9 @@ class Measurement:
 
     @property
     def figure(self) -> tuple[str, str]:
-        """The rate and its unit as text. Memory is an amount, not a rate."""
+        """The rate and its unit as text."""
         rate = f"{self.rate:,.0f}" if self.rate >= 100 else f"{self.rate:.3g}"
-        return rate, self.unit if self.unit == MEGABYTES else f"{self.unit}/s"
+        return rate, self.unit if self.unit in AMOUNTS else f"{self.unit}/s"
 
 
 class Failure(NamedTuple):

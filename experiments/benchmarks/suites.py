@@ -8,6 +8,7 @@ from experiments.benchmarks import compare, growth
 from experiments.benchmarks.measure_batches import bench_batches
 from experiments.benchmarks.measure_checkpoints import bench_checkpoint
 from experiments.benchmarks.measure_envs import bench_env, bench_physics
+from experiments.benchmarks.measure_kernels import bench_kernels
 from experiments.benchmarks.measure_loops import bench_loops
 from experiments.benchmarks.measure_memory import bench_memory
 from experiments.benchmarks.measure_replays import REPLAYS, bench_replay
@@ -15,7 +16,7 @@ from experiments.benchmarks.measure_updates import bench_updates
 from experiments.benchmarks.measurements import Failure, Measurement, error_line
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # measured by default
-MORE_SUITES = ("growth", "memory", "batches")
+MORE_SUITES = ("growth", "memory", "batches", "kernels")
 
 
 class Request(NamedTuple):
@@ -25,6 +26,7 @@ class Request(NamedTuple):
     tasks: Sequence[str]
     algos: Sequence[str]
     physics: Sequence[str]
+    compiled_physics: Sequence[str]  # of the suite kernels
     solver: Mapping[str, dict[str, int]]  # name -> MJX's options
     members: Sequence[int]
     devices: Sequence[int | None]  # None: as a run chooses
@@ -74,6 +76,9 @@ def _suites(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
         elif suite == "batches":
             for algo, task, name in itertools.product(algos, tasks, physics):
                 yield f"batches: {algo} on {task}, {name}", bench_batches(algo, task, members, name)
+        elif suite == "kernels":
+            for algo, task, name in itertools.product(algos, tasks, request.compiled_physics):
+                yield f"kernels: {algo} on {task}, {name}", bench_kernels(algo, task, members, name)
         elif suite == "checkpoint":
             for algo, task in itertools.product(algos, tasks):
                 yield f"checkpoint: {algo}, {task}", bench_checkpoint(algo, task, members, timing["repeats"])

@@ -180,7 +180,8 @@ def make_environment(
 
         ended = terminated | truncated
         state = episode._replace(task=task, steps=steps, unstable=unstable)
-        state, obs = cond_if_any(ended, restart, (state, final_obs))
+        with jax.named_scope("restart"):
+            state, obs = cond_if_any(ended, restart, (state, final_obs))
         return TimeStep(
             state=state,
             obs=obs,

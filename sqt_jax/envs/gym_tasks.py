@@ -108,7 +108,8 @@ def make_task(name: str, physics: str = "mjx", **options: Any) -> Environment:
 
     def advance(state: PhysicsState, action: Array) -> tuple[PhysicsState, Array, Array, Array]:
         control = (low + high) / 2 + action * ((high - low) / 2)
-        state = robot.advance(state, control)
+        with jax.named_scope("physics"):
+            state = robot.advance(state, control)
         terminated = jnp.zeros((), bool) if task.healthy is None else ~task.healthy(state.qpos, state.qvel)
         return state, observe(task, state), reward(task, state, control, control_step, terminated), terminated
 
