@@ -45,13 +45,11 @@ flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay and gro
 flags.DEFINE_list(
     "physics",
     None,
-    "Physics of the suites env, loop, memory, batches and kernels. Default: every physics that can run on this machine "
+    "Physics of the suites env, loop, memory, batches, starts and kernels. Default: every physics of this machine "
     "(kernels, which needs no GPU: mjx and warp).",
 )
 flags.DEFINE_list("solver", [], "More limits of MJX's solver for the suite physics: iterations/line-search steps.")
-flags.DEFINE_list(
-    "algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop, checkpoint, memory, batches and kernels."
-)
+flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of all suites except env, physics and replay.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list(
     "devices", ["auto"], "Numbers of devices for the members of the suites update and loop; auto: as in a run."

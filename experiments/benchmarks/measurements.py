@@ -17,9 +17,10 @@ from sqt_jax.members import usable_devices
 from sqt_jax.types import Array
 
 MEGABYTES = "MB"
+SECONDS = "s"
 KERNELS = "kernels per step"
 QUESTIONS = "questions to the host per step"
-AMOUNTS = (MEGABYTES, KERNELS, QUESTIONS)  # units of a figure that is not a rate
+AMOUNTS = (MEGABYTES, SECONDS, KERNELS, QUESTIONS)  # units of a figure that is not a rate
 PROFILED_STEPS = 4  # lockstep steps; the actor learns in half of them
 
 

@@ -12,11 +12,12 @@ from experiments.benchmarks.measure_kernels import bench_kernels
 from experiments.benchmarks.measure_loops import bench_loops
 from experiments.benchmarks.measure_memory import bench_memory
 from experiments.benchmarks.measure_replays import REPLAYS, bench_replay
+from experiments.benchmarks.measure_starts import bench_starts
 from experiments.benchmarks.measure_updates import bench_updates
 from experiments.benchmarks.measurements import Failure, Measurement, error_line
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # measured by default
-MORE_SUITES = ("growth", "memory", "batches", "kernels")
+MORE_SUITES = ("growth", "memory", "batches", "kernels", "starts")
 
 
 class Request(NamedTuple):
@@ -76,6 +77,9 @@ def _suites(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
         elif suite == "batches":
             for algo, task, name in itertools.product(algos, tasks, physics):
                 yield f"batches: {algo} on {task}, {name}", bench_batches(algo, task, members, name)
+        elif suite == "starts":
+            for algo, task, name in itertools.product(algos, tasks, physics):
+                yield f"starts: {algo} on {task}, {name}", bench_starts(algo, task, members, name)
         elif suite == "kernels":
             for algo, task, name in itertools.product(algos, tasks, request.compiled_physics):
                 yield f"kernels: {algo} on {task}, {name}", bench_kernels(algo, task, members, name)
