@@ -66,7 +66,9 @@ def places(words):
 
 
 PYTHON = programs()
-SHELL = [argv for page in PAGES for argv in commands_in("\n".join(code for kind, _, code in BLOCKS[page] if kind == "sh"))]
+SHELL = [
+    argv for page in PAGES for argv in commands_in("\n".join(code for kind, _, code in BLOCKS[page] if kind == "sh"))
+]
 RUNS = [argv for argv in SHELL if argv[0] == "run"]
 SWEEPS = [argv for argv in SHELL if argv[0] == "sweep"]
 TUNES = [argv for argv in SHELL if argv[0] == "tune"]
@@ -97,7 +99,7 @@ def ids(argv):
     # The library guide's training runs are slow tests; the first page's example of one is not.
     [
         pytest.param(e, marks=pytest.mark.slow)
-        if name_of(e).endswith("README.md:make_environment") and "sqt" in e[0] or name_of(e).endswith(":make_config")
+        if re.search("^sqt_jax/.*:make_(agent|environment|config)$", name_of(e))
         else e
         for e in PYTHON
     ],
@@ -287,12 +289,12 @@ row = lambda key, *shape: jax.random.uniform(key, (4, *shape))
 batch = sqt_jax.Transition(row(keys[0], 3), row(keys[1], 2), row(keys[2]), row(keys[3], 3), jnp.ones(4))
 errors = []
 for agent in agents.values():
-    errors.append(agent.update(agent.init(jax.random.key(1)), batch, keys[4], 0)[1])
+    errors.append(jax.jit(agent.update)(jax.jit(agent.init)(jax.random.key(1)), batch, keys[4], 0)[1])
 assert (errors[0] != errors[1]).all()
 assert sqt_jax.ALGORITHMS["td3_range"].baseline == "td3"
 assert sqt_jax.make_config("td3_range", "ant").agent.penalty_coef == 0.5
 median = sqt_jax.make_agent("td3", 3, 2, hidden=(8,), ensemble_size=3, reduce="median")
-assert median.update(median.init(jax.random.key(1)), batch, keys[4], 0)[1].shape == (4,)
+assert jax.jit(median.update)(jax.jit(median.init)(jax.random.key(1)), batch, keys[4], 0)[1].shape == (4,)
 """
     python_in(extended, code)
 
