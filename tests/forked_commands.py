@@ -6,9 +6,11 @@ streams of any other, but not a start of its own: tests of what Python or JAX re
 """
 
 import contextlib
+import gc
 import json
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tempfile
@@ -52,6 +54,7 @@ def serve():
 
 def become(folder, words):
     """Runs a command in this process, whose streams are now files."""
+    signal.alarm(120)  # seconds: one that hangs ends with the code -14
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     for descriptor, name in enumerate(STREAMS, start=1):
         os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT), descriptor)
@@ -65,6 +68,8 @@ if __name__ == "__main__":
         # None starts a backend of JAX, which could not be forked, or defines flags, which a command does itself.
         import mujoco  # noqa: F401
         import rich.console  # noqa: F401
+        import tensorboardX  # noqa: F401
 
         import sqt_jax.experiment  # noqa: F401
+    gc.freeze()  # a command that ends does not walk through all that was imported here
     serve()
