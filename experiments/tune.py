@@ -12,7 +12,7 @@ or in all trials, 130 interrupted.
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from absl import app, flags
 
@@ -20,8 +20,7 @@ from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, 
 from experiments.commandline.known_flags import parse_known
 from experiments.commandline.path_flags import define_path
 from experiments.launchers import launcher_flags
-from experiments.launchers.choice import make_launcher
-from experiments.launchers.launcher import Launcher
+from experiments.tuning.rounds import Rounds, make_rounds
 from experiments.tuning.tune_flags import OBJECTIVES, SAMPLERS, Given, Options, check_flags
 
 FLAGS = flags.FLAGS
@@ -32,12 +31,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
         reject_folder("--out", options.out)
-        launcher = launcher_flags.given(FLAGS, options.out)
-        workers, here = launcher.workers or 1, launcher.launcher == "local"
-        if not here:  # on a cluster, the number of batches is not the launcher's
-            launcher = launcher._replace(workers=None)
-        first = [make_launcher(launcher)]  # now, so that its flags are checked
-        return tune(options, lambda: first.pop() if first else make_launcher(launcher), workers, workers if here else 0)
+        return tune(options, make_rounds(launcher_flags.given(FLAGS, options.out)))
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
@@ -46,12 +40,12 @@ def main(argv: Sequence[str]) -> int:
         return BAD_USAGE
 
 
-def tune(options: Options, launcher: Callable[[], Launcher], workers: int, workers_here: int) -> int:
-    """Tunes; returns the exit code. Arguments as of `Session` and its `run`."""
+def tune(options: Options, rounds: Rounds) -> int:
+    """Tunes; returns the exit code."""
     from experiments.tuning.session import Session  # imports Optuna and matplotlib
 
     command = shlex.join(["python", "-m", "experiments.tune", *sys.argv[1:]])
-    return Session(options, launcher, workers, FLAGS.retries, command).run(workers_here)
+    return Session(options, rounds, FLAGS.retries, command).run()
 
 
 if __name__ == "__main__":

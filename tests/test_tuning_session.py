@@ -9,6 +9,7 @@ from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED,
 from experiments.launchers.cell import Ended
 from experiments.running import folder_lock
 from experiments.tuning import session
+from experiments.tuning.rounds import Rounds
 from experiments.tuning.session import Session
 from experiments.tuning.tune_flags import check_flags
 
@@ -22,7 +23,7 @@ class MadeLauncher:
     """
 
     def __init__(self, trained, act=lambda cell: None):
-        self.trained, self.act, self._ended = trained, act, []
+        self.trained, self.act, self._ended, self.opened = trained, act, [], []
 
     def submit(self, cells):
         for cell in cells:
@@ -38,30 +39,32 @@ class MadeLauncher:
         pass
 
     def __enter__(self):
+        self.opened.append(True)
         return self
 
     def __exit__(self, *error):
-        pass
+        self.opened.append(False)
 
 
 @pytest.fixture
 def tune(tmp_path, monkeypatch):
     """Tunes in a temporary folder; returns the exit code and the cells that were trained."""
-    monkeypatch.setattr(Session, "_check", lambda self, workers_here: ("cheetah", "cheetah"))
+    monkeypatch.setattr(Session, "_check", lambda self: ("cheetah", "cheetah"))
 
     def run(act=lambda cell: None, run_flags=(), **given):
         small = {"space": "penalty_coef=0..1", "trials": 8, "batch": 4, "final_seeds": 3, "out": str(tmp_path / "out")}
         options = check_flags(GIVEN._replace(**small | given), run_flags)
         trained = []
-        made = Session(options, lambda: MadeLauncher(trained, act), workers=1, retries=0, command="python -m ...")
-        return made.run(1), [cell.path.name for cell in trained]
+        run.launcher = MadeLauncher(trained, act)
+        code = Session(options, Rounds(run.launcher, 1, 1), retries=0, command="python -m ...").run()
+        return code, [cell.path.name for cell in trained]
 
     return run
 
 
 def test_a_study_its_winner_and_the_baseline_are_trained_once(tune, tmp_path, capsys):
     code, trained = tune()
-    assert code == DONE
+    assert code == DONE and tune.launcher.opened == [True, False]  # one for all rounds
     winner = trained[2]
     assert trained == ["batch_0001", "batch_0002", winner, "untuned_seeds_2-4"]
     assert winner.startswith("trial_") and winner.endswith("_seeds_2-4")
@@ -82,7 +85,7 @@ def test_the_baseline_is_tuned_over_the_settings_that_it_has(tune, tmp_path):
 
 def test_what_is_interrupted_continues(tune):
     code, trained = tune(act=lambda cell: INTERRUPTED if cell.path.name == "batch_0002" else None)
-    assert (code, trained) == (INTERRUPTED, ["batch_0001", "batch_0002"])
+    assert (code, trained) == (INTERRUPTED, ["batch_0001", "batch_0002"]) and tune.launcher.opened == [True, False]
     code, trained = tune(act=lambda cell: FAILED if "untuned" in cell.path.name else None)
     assert code == FAILED and trained[0] == "batch_0002" and trained[-1] == "untuned_seeds_2-4"
     assert tune() == (DONE, ["untuned_seeds_2-4"])
@@ -116,10 +119,10 @@ def test_divergence_on_fresh_seeds_is_the_exit_code(tune):
 
 def test_a_check_that_fails_is_one_line(tmp_path, monkeypatch):
     options = check_flags(GIVEN._replace(out=str(tmp_path / "out")), [])
-    made = Session(options, lambda: MadeLauncher([]), 1, 0, "")
+    made = Session(options, Rounds(MadeLauncher([]), 1, 1), 0, "")
     command = ["sh", "-c", f"echo warning >&2; echo '--physics: why' >&2; exit {BAD_USAGE}"]
     real = session.subprocess.run
     monkeypatch.setattr(session.subprocess, "run", lambda _, **how: real(command, **how))
     with pytest.raises(UsageError, match="^--physics: why$"):
-        made.run(1)
+        made.run()
     assert not (tmp_path / "out").exists()

@@ -4,6 +4,7 @@ space.py        the settings that are tuned, and their ranges
 proposals.py    the next trial, as a function of the trials before it
 study.py        the trials in a journal file: asked, told, read again after a kill
 batches.py      the run of a batch of trials, and the trials' values from its files
+rounds.py       where batches are trained: the launcher that all rounds share
 tuner.py        the loop: ask, train, tell
 fresh_seeds.py  the winner and its baseline on seeds that tuning never saw
 """

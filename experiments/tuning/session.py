@@ -17,11 +17,11 @@ from experiments.grids.grid import finished
 from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import train_cells
 from experiments.launchers.cell import Cell, Ended
-from experiments.launchers.launcher import Launcher
 from experiments.running import folder_lock
 from experiments.tuning import report, score_figure
 from experiments.tuning.batches import Task
 from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds
+from experiments.tuning.rounds import OpenLauncher, Rounds
 from experiments.tuning.study import Study, most_trials, open_study
 from experiments.tuning.tune_flags import Options
 from experiments.tuning.tuner import Pace, Plan, run_study, trial_text
@@ -41,23 +41,17 @@ class Session:
     """Tunes an algorithm and its baseline, trains the winners on fresh seeds, and writes the report.
 
     Args:
-      launcher: makes a launcher for each round.
-      workers: batches per round.
       retries: as in `train_cells`.
       command: the command line, for the report.
     """
 
-    def __init__(self, options: Options, launcher: Callable[[], Launcher], workers: int, retries: int, command: str):
-        self.options, self.launcher, self.workers, self.retries = options, launcher, workers, retries
-        self.command = command
+    def __init__(self, options: Options, rounds: Rounds, retries: int, command: str):
+        self.options, self.rounds, self.retries, self.command = options, rounds, retries, command
         self.fresh = fresh_seeds(options.seeds, options.final_seeds)
         self.received: list[int] = []  # signals
 
-    def run(self, workers_here: int) -> int:
+    def run(self) -> int:
         """Returns the exit code.
-
-        Args:
-          workers_here: runs side by side on this machine; 0: they run elsewhere.
 
         Raises:
           UsageError: the runs cannot be trained, or the folder holds another study. Nothing is written then.
@@ -65,18 +59,18 @@ class Session:
         """
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         with collected_signals() as self.received:
-            env, folder = self._check(workers_here)
+            env, folder = self._check()
             if self.received:
                 return INTERRUPTED
             try:
-                with folder_lock.locked(self.options.out, _say):
+                with folder_lock.locked(self.options.out, _say), self.rounds.launcher:
                     return self._tune(env, folder)
             except folder_lock.Busy as busy:
                 raise UsageError(f"--out={self.options.out}: {busy} is tuning there; expects another folder") from None
 
-    def _check(self, workers_here: int) -> tuple[str, str]:
+    def _check(self) -> tuple[str, str]:
         """The name and the folder of the environment, after a check of all runs (`check_runs`)."""
-        options, runs = self.options, []
+        options, workers_here, runs = self.options, self.rounds.workers_here, []
         for algo in filter(None, (options.algo, options.baseline)):
             axes = options.axes_of(algo)
             shared = [f"--algo={algo}", f"--env={options.env}", f"--out={options.out}", *options.flags_of(algo)]
@@ -104,7 +98,7 @@ class Session:
                 _say(
                     f"{part.task.algo} on {env}: {len(part.study.trials)} of {part.trials} trials were asked for before"
                 )
-                plan = Plan(part.task, options.out, options.seeds, options.objective, part.trials, self.workers)
+                plan = Plan(part.task, options.out, options.seeds, options.objective, part.trials, self.rounds.workers)
                 code = run_study(part.study, plan, self._train, _say, lambda: bool(self.received), pace)
                 if code not in (DONE, DIVERGED):
                     return code
@@ -141,9 +135,8 @@ class Session:
         return Part(task, study, most_trials(options.trials, axes, options.sampler))
 
     def _train(self, cells: Sequence[Cell], on_end: Callable[[Ended], None]) -> int:
-        return train_cells(
-            cells, self.launcher(), _say, retries=self.retries, signals=lambda: len(self.received), on_end=on_end
-        )
+        launcher, signals = OpenLauncher(self.rounds.launcher), lambda: len(self.received)
+        return train_cells(cells, launcher, _say, retries=self.retries, signals=signals, on_end=on_end)
 
     def _tuned(self, winner: Winner) -> str:
         """How a winner was tuned, as its run records it."""
