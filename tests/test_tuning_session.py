@@ -112,6 +112,30 @@ def test_one_process_tunes_in_a_folder(tune, tmp_path):
         tune()
 
 
+def refuse(cell):
+    raise UsageError("--slurm: why")
+
+
+def test_a_new_folder_is_as_before_when_its_first_batch_is_refused(tune, tmp_path):
+    out = tmp_path / "out"
+    for existing in (False, True):
+        if existing:
+            out.mkdir()
+            (out / "mine").touch()
+        with pytest.raises(UsageError, match="^--slurm: why$"):
+            tune(act=refuse)
+        assert out.exists() == existing
+    assert [path.name for path in out.iterdir()] == ["mine"]
+
+
+def test_a_study_stays_when_a_batch_is_refused(tune, tmp_path):
+    tune(act=lambda cell: INTERRUPTED)
+    before = (tmp_path / "out" / "study.log").read_bytes()
+    with pytest.raises(UsageError, match="^--slurm: why$"):
+        tune(act=refuse)
+    assert (tmp_path / "out" / "study.log").read_bytes() == before
+
+
 def test_divergence_on_fresh_seeds_is_the_exit_code(tune):
     code, trained = tune(space="penalty_coef=0.91|0.95", sampler="grid", trials=2, objective="final")
     assert code == DIVERGED and trained == ["batch_0001", "untuned_seeds_2-4"]  # all trials diverged

@@ -19,10 +19,12 @@ from experiments.grids.train_cells import train_cells
 from experiments.launchers.cell import Cell, Ended
 from experiments.running import folder_lock
 from experiments.tuning import report, score_figure
+from experiments.tuning.batches import FOLDER as TRIALS
 from experiments.tuning.batches import Task
+from experiments.tuning.first_refusal import removed_if_refused
 from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds
 from experiments.tuning.rounds import OpenLauncher, Rounds
-from experiments.tuning.study import Study, most_trials, open_study
+from experiments.tuning.study import FILE, Study, most_trials, open_study
 from experiments.tuning.tune_flags import Options
 from experiments.tuning.tuner import Pace, Plan, run_study, trial_text
 
@@ -54,7 +56,8 @@ class Session:
         """Returns the exit code.
 
         Raises:
-          UsageError: the runs cannot be trained, or the folder holds another study. Nothing is written then.
+          UsageError: the runs cannot be trained, or the folder holds another study. Nothing is written then, except
+            that a study that was there before keeps the trials that it asked for.
           OSError: the folder cannot be written.
         """
         optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -62,11 +65,13 @@ class Session:
             env, folder = self._check()
             if self.received:
                 return INTERRUPTED
+            out = self.options.out
+            new = [path for path in (out / FILE, out / "lock", out) if not path.exists()]
             try:
-                with folder_lock.locked(self.options.out, _say), self.rounds.launcher:
+                with folder_lock.locked(out, _say), removed_if_refused(new, out / TRIALS), self.rounds.launcher:
                     return self._tune(env, folder)
             except folder_lock.Busy as busy:
-                raise UsageError(f"--out={self.options.out}: {busy} is tuning there; expects another folder") from None
+                raise UsageError(f"--out={out}: {busy} is tuning there; expects another folder") from None
 
     def _check(self) -> tuple[str, str]:
         """The name and the folder of the environment, after a check of all runs (`check_runs`)."""
