@@ -6,8 +6,8 @@ trials. OUT gets the trials (study.log, which optuna-dashboard opens; trials.csv
 tuning.csv and tuning.png.
 
 Flags other than those below go to every run, for example --steps=20000 or --physics=mujoco. The same command continues
-a study that was stopped or killed. Exit codes: 0 done, 1 a run failed, 2 bad usage, 3 a member diverged on fresh seeds
-or in all trials, 130 interrupted.
+a study that was stopped or killed. Exit codes: 0 done, 1 a run failed or the results could not be written, 2 bad
+usage, 3 a member diverged on fresh seeds or in all trials, 130 interrupted.
 """
 
 import shlex
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from absl import app, flags
 
-from experiments.commandline.arguments import BAD_USAGE, UsageError, printable, reject_folder
+from experiments.commandline.arguments import BAD_USAGE, FAILED, UsageError, printable, reject_folder
 from experiments.commandline.known_flags import parse_known
 from experiments.commandline.path_flags import define_path
 from experiments.launchers import launcher_flags
@@ -35,9 +35,9 @@ def main(argv: Sequence[str]) -> int:
     except UsageError as error:
         print(printable(str(error)), file=sys.stderr)
         return BAD_USAGE
-    except OSError as error:
+    except OSError as error:  # --out was checked: a full disk, for example
         print(printable(f"--out={FLAGS.out}: expects a folder that can be written: {error}"), file=sys.stderr)
-        return BAD_USAGE
+        return FAILED
 
 
 def tune(options: Options, rounds: Rounds) -> int:

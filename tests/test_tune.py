@@ -69,3 +69,11 @@ def test_64_trials_of_two_seeds_are_one_compilation(tmp_path):
     assert [log.name for log in logs] == ["batch_0001.log.txt"] and len(trials(tmp_path)) == 64
     compiled = re.findall(r"Finished XLA compilation of jit\((\w+)\)", logs[0].read_text())
     assert compiled.count("advance") == compiled.count("evaluate_policy") == 1
+
+
+def test_a_log_that_cannot_be_written_is_a_failure(tmp_path):
+    log = tmp_path / "trials" / "cheetah" / "td3_sqt" / "batch_0001.log.txt"
+    log.mkdir(parents=True)
+    process = start(tmp_path, "--space=penalty_coef=0..1", "--trials=2", "--batch=2")
+    printed = process.communicate(timeout=300)[0]
+    assert process.returncode == 1 and str(log) in printed and "Traceback" not in printed

@@ -5,8 +5,9 @@ import shutil
 import pytest
 from tuned_runs import contents, make_study, run, train, write_cell
 
-from experiments.commandline.arguments import DONE, FAILED, INTERRUPTED
+from experiments.commandline.arguments import DONE, FAILED, INTERRUPTED, UsageError
 from experiments.launchers.cell import Ended
+from experiments.tuning.study import Study
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,23 @@ def test_a_batch_that_fails_ends_the_study_and_is_trained_again_with_its_values(
     values = [trial.params for trial in study.running]
     again, ended = run(tmp_path)
     assert ended == DONE and [trial.params for trial in again.trials[:4]] == values and len(again.trials) == 12
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), UsageError("--out: why")])
+def test_a_result_that_cannot_be_written_is_raised_when_the_other_batches_have_ended(tmp_path, monkeypatch, error):
+    told = []
+
+    def failing(study, trial, result):
+        told.append(trial.number)
+        raise error
+
+    with monkeypatch.context() as patch, pytest.raises(type(error), match="space|why"):
+        patch.setattr(Study, "tell", failing)
+        run(tmp_path, workers=2)
+    # After a line that was torn, no other may be written.
+    assert told == [0] and len([*(tmp_path / "trials/cheetah/td3_sqt").glob("*/summary.json")]) == 2
+    study, code = run(tmp_path, workers=2, train=lambda *_: pytest.fail("it is trained again"), trials=8)
+    assert code == DONE and not study.running
 
 
 def test_a_signal_stops_before_more_is_asked_for(tmp_path):

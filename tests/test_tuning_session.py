@@ -136,6 +136,12 @@ def test_a_study_stays_when_a_batch_is_refused(tune, tmp_path):
     assert (tmp_path / "out" / "study.log").read_bytes() == before
 
 
+def test_a_report_that_cannot_be_written_is_no_bad_usage(tune, tmp_path):
+    (tmp_path / "out" / "trials.csv").mkdir(parents=True)
+    with pytest.raises(OSError):
+        tune()
+
+
 def test_divergence_on_fresh_seeds_is_the_exit_code(tune):
     code, trained = tune(space="penalty_coef=0.91|0.95", sampler="grid", trials=2, objective="final")
     assert code == DIVERGED and trained == ["batch_0001", "untuned_seeds_2-4"]  # all trials diverged

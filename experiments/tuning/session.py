@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import optuna
 
-from experiments.commandline import arguments
 from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED, UsageError, printable
 from experiments.evidence import formats
 from experiments.evidence.groups import Group
@@ -17,7 +16,7 @@ from experiments.grids.grid import finished
 from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import train_cells
 from experiments.launchers.cell import Cell, Ended
-from experiments.running import folder_lock
+from experiments.running import files, folder_lock
 from experiments.tuning import report, score_figure
 from experiments.tuning.batches import FOLDER as TRIALS
 from experiments.tuning.batches import Task
@@ -57,7 +56,8 @@ class Session:
 
         Raises:
           UsageError: the runs cannot be trained, or the folder holds another study. Nothing is written then, except
-            that a study that was there before keeps the trials that it asked for.
+            that a study that was there before keeps the trials that it asked for. Or: a run of the study cannot be
+            read.
           OSError: the folder cannot be written.
         """
         optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -165,7 +165,9 @@ class Session:
         text = report.report_text(table, tuned, setup, FIGURE if figure else None)
         contents = {"tuning.md": text.encode(), "tuning.csv": formats.comma_separated(table).encode()}
         contents |= {"trials.csv": report.trials_csv([one.winner for one in tuned]).encode()}
-        arguments.write_files(options.out, contents | ({FIGURE: figure} if figure else {}))
+        for name, content in (contents | ({FIGURE: figure} if figure else {})).items():
+            with files.atomic_file(options.out / name) as file:
+                file.write(content)
         formats.show([table], "terminal")
         for one in tuned:
             if one.winner.is_trained:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from optuna.trial import FrozenTrial
 
-from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED
+from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED, UsageError
 from experiments.evidence.cells import number
 from experiments.grids.grid import finished
 from experiments.launchers.cell import Cell, Ended
@@ -64,15 +64,26 @@ def run_study(
 
     Returns:
       `DONE`; `INTERRUPTED`; or the exit code of the runs of a round that failed. The same call continues then.
+
+    Raises:
+      UsageError, OSError: a run cannot be read, or a result not written. Nothing trains any more then.
     """
     pace.passed((len(study.trials) - len(study.running)) * len(plan.seeds), trained=False)
+    untold: list[OSError | UsageError] = []
 
     def tell_ended(ended: Ended) -> None:
-        if ended.code in (DONE, DIVERGED):
-            batch = next(batch for batch in batches().values() if batch.cell == ended.cell)
-            tell_batch(study, batch, plan.objective)
-            pace.passed(len(batch.trials) * len(plan.seeds))
-            say(f"{batch.cell.label}, {batch.cell.path.name}: {batch_text(study, batch)}{pace.left}")
+        """Tells the results of a batch; not after an error: what is written after a torn line cannot be read."""
+        if ended.code in (DONE, DIVERGED) and not untold:
+            try:
+                tell_and_say(ended)
+            except (OSError, UsageError) as error:  # raised now, it would kill the batches that still train
+                untold.append(error)
+
+    def tell_and_say(ended: Ended) -> None:
+        batch = next(batch for batch in batches().values() if batch.cell == ended.cell)
+        tell_batch(study, batch, plan.objective)
+        pace.passed(len(batch.trials) * len(plan.seeds))
+        say(f"{batch.cell.label}, {batch.cell.path.name}: {batch_text(study, batch)}{pace.left}")
 
     def batches() -> dict[int, Batch]:
         return batches_of(study.trials, plan.task, study.axes, plan.out, plan.seeds)
@@ -90,6 +101,8 @@ def run_study(
         todo = [batch.cell for batch in batches().values() if running & {trial.number for trial in batch.trials}]
         if todo:
             code = train(todo, tell_ended)
+            if untold:
+                raise untold[0]
             if code not in (DONE, DIVERGED):
                 return code
         elif len(study.trials) >= plan.trials:
