@@ -13,9 +13,10 @@ from experiments.commandline.arguments import UsageError
 from experiments.evidence.comparisons import against_baseline
 from experiments.evidence.paper_tables import table_2
 from experiments.evidence.pooling import collect
+from experiments.running import folder_lock
 from experiments.tuning import score_figure
 from experiments.tuning.batches import Task
-from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds
+from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds, show_only
 from experiments.tuning.report import (
     AT_START,
     FEW,
@@ -38,6 +39,29 @@ def test_fresh_seeds_are_above_those_of_the_tuning():
     assert fresh_seeds((0, 1), 3) == (2, 3, 4) and fresh_seeds((7, 3), 2) == (8, 9)
     with pytest.raises(UsageError, match="^--seeds=4294967290: expects seeds with --final_seeds=10 larger ones"):
         fresh_seeds((4294967290,), 10)
+
+
+def test_runs_of_earlier_winners_are_put_aside_with_their_files(tmp_path):
+    cells = {name: TASK.cell(tmp_path / "final", name, FRESH) for name in ("trial_1_seeds_2-4", "trial_2_seeds_2-4")}
+    for cell in cells.values():
+        train([cell], lambda ended: None)
+        cell.log.write_text(cell.path.name)
+    final, aside = cell.path.parent, tmp_path / "trials" / "cheetah" / "td3_sqt"
+    names = [(name, f"{name}.log.txt") for name in cells]
+    for shown, hidden in ((0, 1), (1, 0)):
+        show_only([[*cells.values()][shown]], tmp_path, print)
+        assert {path.name for path in final.iterdir()} == {*names[shown]}
+        assert {path.name for path in aside.iterdir()} == {*names[hidden]}
+
+
+def test_a_run_that_still_trains_stays(tmp_path):
+    old, new = (TASK.cell(tmp_path / "final", f"trial_{n}_seeds_2-4", FRESH) for n in (1, 2))
+    lines = []
+    with folder_lock.locked(old.path):
+        show_only([new], tmp_path, lines.append)
+        assert old.path.exists() and len(lines) == 1 and lines[0].startswith(f"{old.path} stays there")
+    show_only([new], tmp_path, lines.append)
+    assert not old.path.exists() and len(lines) == 1
 
 
 def test_paired_differences_by_hand():

@@ -6,6 +6,7 @@ import pytest
 from tuned_runs import GIVEN, write_cell
 
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED, UsageError
+from experiments.evidence.finished_runs import find
 from experiments.launchers.cell import Ended
 from experiments.running import folder_lock
 from experiments.tuning import session
@@ -96,6 +97,31 @@ def test_a_signal_stops_before_the_next_batch(tune):
     assert (code, trained) == (INTERRUPTED, ["batch_0001"])
 
 
+@pytest.fixture
+def no_figure(monkeypatch):
+    """Drawing takes most of a tuning's time here."""
+    monkeypatch.setattr(session.score_figure, "draw", lambda *_: None)
+
+
+@pytest.mark.usefixtures("no_figure")
+def test_only_the_present_winners_runs_on_fresh_seeds_are_shown(tune, tmp_path):
+    """Tables, plots and the report read all runs below OUT, without its trials."""
+    out = tmp_path / "out"
+
+    def shown():
+        return {path.name for path in find([str(out)])[0]}
+
+    tune(trials=4, final_seeds=2)
+    first = shown()
+    _, trained = tune(trials=4, final_seeds=3)
+    assert shown() == set(trained) == {name.replace("2-3", "2-4") for name in first}
+    # Back again, with nothing to train; then another trial wins.
+    assert tune(trials=4, final_seeds=2) == (DONE, []) and shown() == first
+    _, trained = tune(trials=8, final_seeds=2)
+    winner = trained[-1]
+    assert winner.startswith("trial_") and shown() == {winner, "untuned_seeds_2-3"} != first
+
+
 def test_other_settings_need_another_folder(tune):
     tune()
     for given in ({"batch": 5}, {"seeds": ["0", "2"]}, {"objective": "final"}, {"run_flags": ["--steps=2000000"]}):
@@ -136,6 +162,7 @@ def test_a_study_stays_when_a_batch_is_refused(tune, tmp_path):
     assert (tmp_path / "out" / "study.log").read_bytes() == before
 
 
+@pytest.mark.usefixtures("no_figure")
 def test_a_report_that_cannot_be_written_is_no_bad_usage(tune, tmp_path):
     (tmp_path / "out" / "trials.csv").mkdir(parents=True)
     with pytest.raises(OSError):

@@ -21,7 +21,7 @@ from experiments.tuning import report, score_figure
 from experiments.tuning.batches import FOLDER as TRIALS
 from experiments.tuning.batches import Task
 from experiments.tuning.first_refusal import removed_if_refused
-from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds
+from experiments.tuning.fresh_seeds import Winner, fresh_cell, fresh_seeds, show_only
 from experiments.tuning.rounds import OpenLauncher, Rounds
 from experiments.tuning.study import FILE, Study, most_trials, open_study
 from experiments.tuning.tune_flags import Options
@@ -114,9 +114,10 @@ class Session:
         cells = {
             winner.task.algo: fresh_cell(winner, options.out, self.fresh, self._tuned(winner)) for winner in winners
         }
-        todo = [cells[w.task.algo] for w in winners if w.is_trained and not finished(cells[w.task.algo])]
         if self.received:
             return INTERRUPTED
+        show_only([*cells.values()], options.out, _say)
+        todo = [cells[w.task.algo] for w in winners if w.is_trained and not finished(cells[w.task.algo])]
         if todo:
             _say(f"fresh seeds {self.fresh[0]} to {self.fresh[-1]}: {len(todo)} runs{pace.left}")
         code = self._train(todo, lambda ended: pace.passed(len(self.fresh)))
