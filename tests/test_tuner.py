@@ -115,10 +115,19 @@ def test_a_round_has_a_batch_for_each_worker(tmp_path):
     assert [trial.user_attrs["batch"] for trial in study.trials] == [1] * 4 + [2] * 4 + [3] * 4 + [4] * 2
 
 
-def test_more_trials_continue_a_study(whole, tmp_path):
+def test_more_trials_after_whole_rounds_continue_a_study_as_the_unbroken_one(whole, tmp_path):
     run(tmp_path, trials=8)
     study, _ = run(tmp_path, trials=12)
     assert contents(study) == whole[1]
+
+
+def test_more_trials_after_a_smaller_round_do_not_fill_it_up(whole, tmp_path):
+    """They are proposed with its results, which the trials of an unbroken study do not know in their round."""
+    run(tmp_path, trials=10)
+    study, _ = run(tmp_path, trials=12)
+    assert [trial.user_attrs["batch"] for trial in study.trials] == [1] * 4 + [2] * 4 + [3] * 2 + [4] * 2
+    same = [trial.params == params for trial, (params, *_) in zip(study.trials, whole[1], strict=True)]
+    assert same == [True] * 10 + [False] * 2
 
 
 def test_a_trial_with_the_values_of_an_earlier_one_gets_its_result(tmp_path):
