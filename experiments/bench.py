@@ -11,11 +11,13 @@ Suites:
   memory      peak memory of a run
   batches     whole runs: all members in one process, and in 8 processes side by side
   kernels     what a GPU would launch in a lockstep step, by part of the step: compiled for one that is not there
+  starts      whole seconds of a run of two steps, with an empty compilation cache and with a filled one
+  gpu         all to be known about a GPU, most telling first, each part in a process of its own: see --parts
 --suite=gpu and --suite=growth are named sets of flags. --compare=sbx measures another implementation as well.
 
 A measurement compiles a loop (a second to a minute) and reports the median of --repeats timed calls of about --seconds
-each. The default is every suite except growth, memory, batches and kernels, on four tasks, with three algorithms, 1
-and 5 members: about 200 measurements, each roughly 10 to 90 seconds on a CPU with two cores. One measurement:
+each. The default is the suites env to checkpoint on four tasks, with three algorithms, 1 and 5 members: about 200
+measurements, each roughly 10 to 90 seconds on a CPU with two cores. One measurement:
 --suites=update --algos=td3 --tasks=cheetah --members=5 --nopeak
 
 A machine's speed varies. Compare only figures of one command, or of commands that alternate. To compare the
@@ -30,6 +32,7 @@ A measurement that fails prints a line that begins with `failed`; the others con
 written again after each measurement.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -55,6 +58,8 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     logging.set_verbosity(logging.WARNING)
     environment = compare.peer_environment() if FLAGS.compare else {}
+    if "gpu" in FLAGS.suites:  # its processes share the GPU's memory with this one
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     jax_settings.prepare()
     jax_settings.start_jax(bench_flags.most_devices())
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured

@@ -7,7 +7,8 @@ import optax
 from sqt_jax import trees
 from sqt_jax.types import Array, Params
 
-_adam = optax.scale_by_adam()
+_B1, _B2, _EPS = 0.9, 0.999, 1e-8  # optax's defaults, PyTorch's too
+_adam = optax.scale_by_adam(_B1, _B2, _EPS)
 adam_init = _adam.init  # parameters -> moments
 
 
@@ -19,9 +20,13 @@ def adam_step(
     Returns the parameters, the optimizer's state and whether the agent has diverged now.
     """
     diverged = diverged | ~jnp.isfinite(optax.tree.norm(grads, squared=True))
-    direction, moments = _adam.update(grads, opt_state)
-    moved = optax.apply_updates(params, jax.tree.map(lambda d: -lr * d, direction))
-    return trees.where(diverged, params, moved), trees.where(diverged, opt_state, moments), diverged
+    _, moments = _adam.update(grads, opt_state)
+    # The barrier: on a CPU XLA would compute the moments twice, the second time from copies of the old ones.
+    moments = jax.lax.optimization_barrier(trees.where(diverged, opt_state, moments))
+    mean = optax.tree.bias_correction(moments.mu, _B1, moments.count)
+    variance = optax.tree.bias_correction(moments.nu, _B2, moments.count)
+    step = jax.tree.map(lambda m, v: -lr * (m / (jnp.sqrt(v) + _EPS)), mean, variance)
+    return trees.where(diverged, params, optax.apply_updates(params, step)), moments, diverged
 
 
 def soft_update(target: Params, online: Params, tau: Array | float, diverged: Array) -> Params:

@@ -1,4 +1,4 @@
-"""MJX-Warp against MuJoCo C. Warp runs on a CPU too: all of this needs its package only."""
+"""MuJoCo Warp against MuJoCo C. Warp runs on a CPU too: all of this needs its package only."""
 
 import jax
 import jax.numpy as jnp
@@ -53,3 +53,17 @@ def test_a_diverged_robot_ends_its_episode_and_no_other():
     after = jax.jit(jax.vmap(env.step))(broken, jnp.zeros((3, 6)))
     assert after.terminated.tolist() == [False, True, False]
     assert np.all(np.isfinite(after.obs)) and np.all(np.isfinite(after.reward))
+
+
+def test_a_call_remembers_nothing_of_the_calls_before_it():
+    """The simulator's data are kept between calls; a diverged robot is the worst that they can hold."""
+    env = envs.make("cheetah", "warp")
+    timesteps = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
+    actions = jax.random.uniform(jax.random.key(1), (3, 6), minval=-1)
+    step = jax.jit(jax.vmap(env.step))
+    first = step(timesteps, actions)
+    step(first, -actions)
+    step(jax.vmap(env.set_physics)(first.state.task.qpos, first.state.task.qvel.at[:, 2].set(jnp.nan)), actions)
+    again = step(timesteps, actions)
+    for one, other in zip(jax.tree.leaves(first.state.task), jax.tree.leaves(again.state.task), strict=True):
+        np.testing.assert_array_equal(one, other)

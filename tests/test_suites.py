@@ -23,7 +23,8 @@ def test_a_measurement_that_raises_is_a_failure_and_the_next_is_made(monkeypatch
 
 def test_every_suite_makes_its_measurements(monkeypatch):
     made = []
-    for name in ("env", "physics", "updates", "replay", "memory", "batches", "checkpoint", "loops"):
+    names = ("env", "physics", "updates", "replay", "memory", "batches", "kernels", "starts", "checkpoint", "loops")
+    for name in names:
         monkeypatch.setattr(
             suites, f"bench_{name}", lambda *case, name=name, **timing: made.append((name, *case)) or []
         )
@@ -34,6 +35,7 @@ def test_every_suite_makes_its_measurements(monkeypatch):
         tasks=["ant"],
         algos=["td3", "td7"],
         physics=["mjx"],
+        compiled_physics=["warp"],
         members=[5],
         devices=[None],
         capacities=[10],
@@ -54,6 +56,10 @@ def test_every_suite_makes_its_measurements(monkeypatch):
         ("memory", "td7", "ant", 5, 10, "mjx"),
         ("batches", "td3", "ant", 5, "mjx"),
         ("batches", "td7", "ant", 5, "mjx"),
+        ("kernels", "td3", "ant", 5, "warp"),
+        ("kernels", "td7", "ant", 5, "warp"),
+        ("starts", "td3", "ant", 5, "mjx"),
+        ("starts", "td7", "ant", 5, "mjx"),
         ("growth", ["td3", "td7"], "ant", 5),
         ("compare", "sbx", "td3", "ant", 5, ["mjx"], "python", {}),
     ]

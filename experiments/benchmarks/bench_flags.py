@@ -13,7 +13,7 @@ from typing import Any
 import jax
 from absl import flags
 
-from experiments.benchmarks import compare, gpu_target, growth, measure_kernels
+from experiments.benchmarks import compare, gpu_target, growth, measure_gpu, measure_kernels
 from experiments.benchmarks.suites import MORE_SUITES, SUITES, Request
 from experiments.commandline import arguments
 from experiments.commandline.path_flags import define_path
@@ -23,12 +23,13 @@ from sqt_jax import algorithms, envs
 # --suite: flags by name, which flags on the command line override.
 NAMED_SUITES: dict[str, dict[str, Any]] = {
     "gpu": {
-        "suites": ["loop"],
-        "algos": ["td3", "td7"],
-        "tasks": ["ant", "humanoid"],
-        "members": ["5", "64", "512"],
-        "devices": ["1", "auto"],
-        "profile": True,
+        "suites": ["gpu"],
+        "tasks": ["ant"],
+        "members": ["25", "100", "250"],
+        "physics": list(measure_gpu.PHYSICS),
+        "devices": ["1"],
+        "seconds": 2.0,
+        "repeats": 3,
     },
     "growth": {"suites": ["growth"], "tasks": ["cheetah"], "members": ["5"]},
 }
@@ -38,20 +39,18 @@ flags.DEFINE_enum(
     "suite",
     None,
     list(NAMED_SUITES),
-    "A named set of flags: gpu (loops of td3 and td7 with up to 512 members, profiled) or growth (cost over members, "
-    "critics and capacity). Flags on the command line override it.",
+    "A named set of flags: gpu (all to be known about a GPU in 15 minutes) or growth (cost over members, critics and "
+    "capacity). Flags on the command line override it.",
 )
-flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay and growth use only the first one.")
+flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay, growth and gpu use only the first one.")
 flags.DEFINE_list(
     "physics",
     None,
-    "Physics of the suites env, loop, memory, batches and kernels. Default: every physics that can run on this machine "
+    "Physics of the suites env, loop, memory, batches, starts and kernels. Default: every physics of this machine "
     "(kernels, which needs no GPU: mjx and warp).",
 )
 flags.DEFINE_list("solver", [], "More limits of MJX's solver for the suite physics: iterations/line-search steps.")
-flags.DEFINE_list(
-    "algos", ["td3", "sac", "td7"], "Algorithms of the suites update, loop, checkpoint, memory, batches and kernels."
-)
+flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of all suites except env, physics and replay.")
 flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
 flags.DEFINE_list(
     "devices", ["auto"], "Numbers of devices for the members of the suites update and loop; auto: as in a run."
@@ -59,6 +58,9 @@ flags.DEFINE_list(
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suites replay and memory.")
 flags.DEFINE_boolean("profile", False, "Also count and time the device operations of the suite loop.")
 flags.DEFINE_boolean("peak", True, "Also measure the peak of matrix products, which updates are compared with.")
+flags.DEFINE_list(
+    "parts", list(measure_gpu.PARTS), f"Parts of the suite gpu, made in this order: {', '.join(measure_gpu.PARTS)}."
+)
 define_path("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list(
     "compare", [], f"Other implementations to measure, interleaved with ours: {', '.join(compare.NEEDS)}."
@@ -74,7 +76,7 @@ def check_flags() -> None:
     for name, value in NAMED_SUITES.get(FLAGS.suite, {}).items():
         if not FLAGS[name].present:
             FLAGS[name].value = value
-    for name in ("tasks", "algos", "members", "devices", "capacities", "physics"):
+    for name in ("tasks", "algos", "members", "devices", "capacities", "physics", "parts"):
         if FLAGS[name].value == []:  # only --suites may be empty, next to --compare
             sys.exit(f"--{name}: expects at least one")
     known = {
@@ -83,6 +85,7 @@ def check_flags() -> None:
         "tasks": envs.TASKS,
         "algos": algorithms.ALGORITHMS,
         "physics": envs.PHYSICS,
+        "parts": measure_gpu.PARTS,
     }
     for name, values in known.items():
         for value in getattr(FLAGS, name) or ():
@@ -144,7 +147,9 @@ def physics_here() -> list[str]:
         return []
     for name in FLAGS.physics or ():
         if missing := envs.lacks(name):
-            sys.exit(f"--physics: {name} needs {missing}")
+            others = ",".join(other for other in FLAGS.physics if other != name)
+            without = f"; --physics={others} leaves it out" if others else ""
+            sys.exit(f"--physics: {name} needs {missing}{without}")
     return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
 
 
@@ -185,6 +190,7 @@ def request() -> Request:
         devices=devices_here(),
         capacities=[int(value) for value in FLAGS.capacities],
         profile=FLAGS.profile,
+        parts=FLAGS.parts,
         compare=FLAGS.compare,
         peer_python=FLAGS.peer_python,
     )

@@ -1,0 +1,51 @@
+"""How long a run takes to start: `python -m experiments.bench --suites=starts --tasks=humanoid --physics=mjx`.
+
+A whole run of one step of warm-up and one of training, as a process: Python's imports, the compilation of evaluation,
+warm-up and training, two evaluations of one episode, and the policy. First with an empty compilation cache (cold), then
+with the cache that this left (warm).
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from experiments.benchmarks.measurements import SECONDS, Measurement
+
+FLAGS = ("--steps=2", "--warmup_steps=1", "--eval_every=2", "--eval_episodes=1", "--replay_capacity=1000")
+NO_FILES = ("--checkpoint_every=0", "--notensorboard", "--quiet")
+
+
+def run_process(command: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Runs a command to its end. Raises `RuntimeError` with the last line of its errors if it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        raise RuntimeError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
+
+
+def bench_starts(
+    algo: str,
+    task: str,
+    members: int,
+    physics: str,
+    run: Callable[[Sequence[str], Mapping[str, str]], None] = run_process,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Iterator[Measurement]:
+    """Seconds of a cold start, then of a warm one.
+
+    Args:
+      run: as `run_process`.
+    """
+    seeds = ",".join(map(str, range(members)))
+    command = [sys.executable, "-m", "experiments.run", f"--algo={algo}", f"--env={task}", f"--physics={physics}"]
+    with tempfile.TemporaryDirectory() as folder:
+        for start in ("cold", "warm"):
+            began = clock()
+            run(
+                [*command, f"--seeds={seeds}", f"--out={folder}/{start}", *FLAGS, *NO_FILES],
+                {**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"},
+            )
+            what = f"{algo} on {task}, {physics}, {start}"
+            yield Measurement(suite="starts", what=what, members=members, unit=SECONDS, rate=clock() - began)
