@@ -6,7 +6,7 @@ It prints each measurement as a line of `part_process`.
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import jax
 
@@ -62,7 +62,12 @@ def profile(algo: str, task: str, physics: str, members: int, label: str = "") -
         yield Measurement(suite="profile", what=what, members=members, unit=unit, rate=number / PROFILED_STEPS)
 
 
-KINDS = {"loop": loop, "parity": parity, "profile": profile, "exact": exact_resume.compare}
+KINDS: dict[str, Callable[..., Iterator[Measurement | Failure]]] = {
+    "loop": loop,
+    "parity": parity,
+    "profile": profile,
+    "exact": exact_resume.compare,
+}
 
 
 def main(kind: str, arguments: str) -> None:

@@ -43,7 +43,7 @@ def count(events: Sequence[Event]) -> Work:
         graphs=max(launched, run),
         copies_to_host=sum(number for name, number in names.items() if re.match("memcpyd(2|to)h", name, re.I)),
         seconds=total,
-        longest={name: spent / total for name, spent in seconds.most_common(10)},
+        longest={name: spent / total for name, spent in seconds.most_common(5)},
     )
 
 

@@ -43,7 +43,7 @@ def parts_of(
       physics: some of `PHYSICS`.
       timing: `seconds` and `repeats` of `timing.measure`.
     """
-    few, more, most = (*members, *members[-1:] * 2)[:3]
+    few, more, most = [*members, members[-1], members[-1]][:3]
     here = [name for name in PHYSICS if name in physics]
     main = here[0]
 
@@ -71,8 +71,8 @@ def parts_of(
         "td7": [loop(SECOND_ALGO, main, few, 120)],
         "exact": [
             loop(ALGO, main, few, 90, ", deterministic kernels", DETERMINISTIC),
-            Part("exact", {**case, "label": ", deterministic kernels"}, 180, DETERMINISTIC),
-            Part("exact", case, 180),
+            Part("exact", {**case, "label": ", deterministic kernels"}, 240, DETERMINISTIC),
+            Part("exact", case, 240),
         ],
     }
     return [part for name in PARTS if name in names for part in made[name]]

@@ -46,7 +46,10 @@ def measure_all(request: Request, environment: Mapping[str, str], **timing: Any)
       timing: `seconds` and `repeats` of `timing.measure`.
     """
     for what, measurements in itertools.chain(
-        _suites(request, timing), _gpu(request, timing), _growth(request, timing), _comparisons(request, environment, timing)
+        _suites(request, timing),
+        _gpu(request, timing),
+        _growth(request, timing),
+        _comparisons(request, environment, timing),
     ):
         try:
             yield from measurements
