@@ -134,6 +134,7 @@ def test_the_gpu_suite_runs_here(tmp_path):
         "--tasks=cheetah",
         "--parts=loops",
         "--members=1",
+        "--patience=10",
     ]
     command += ["--physics=mujoco", "--seconds=0", "--repeats=1", f"--json={tmp_path / 'bench.json'}"]
     done = subprocess.run(command, cwd=Path(__file__).parent.parent, capture_output=True, text=True)

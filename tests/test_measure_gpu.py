@@ -24,6 +24,11 @@ def test_the_most_telling_part_comes_first():
     assert [part.flags for part in parts[-3:]] == [DETERMINISTIC, DETERMINISTIC, ""]
 
 
+def test_ten_minutes_suffice_for_the_first_three_parts():
+    parts = parts_of(PARTS[:3], "ant", [25, 100, 250], measure_gpu.PHYSICS, **SHORT)
+    assert sum(part.limit for part in parts) <= 600
+
+
 def test_each_option_has_a_process_of_its_own():
     parts = parts_of(["options"], "ant", [25], ["warp"], **SHORT)
     assert [part.flags for part in parts] == [option.flags for option in OPTIONS.values()]
@@ -54,8 +59,8 @@ def test_each_process_has_its_flags(monkeypatch):
     monkeypatch.setattr(measure_gpu.part_process, "results", results)
     monkeypatch.setenv("XLA_FLAGS", "--xla_mine=1")
     parts = [Part("parity", {"task": "ant", "physics": "mjx"}, 7), Part("exact", {"task": "ant"}, 8, DETERMINISTIC)]
-    assert list(measure_gpu.bench_gpu(parts)) == ["parity: ant, mjx", "exact: ant"]
+    assert list(measure_gpu.bench_gpu(parts, patience=2)) == ["parity: ant, mjx", "exact: ant"]
     assert seen == [
-        (["parity", '{"task": "ant", "physics": "mjx"}'], "parity: ant, mjx", 7, "--xla_mine=1"),
-        (["exact", '{"task": "ant"}'], "exact: ant", 8, f"--xla_mine=1 {DETERMINISTIC}"),
+        (["parity", '{"task": "ant", "physics": "mjx"}'], "parity: ant, mjx", 14, "--xla_mine=1"),
+        (["exact", '{"task": "ant"}'], "exact: ant", 16, f"--xla_mine=1 {DETERMINISTIC}"),
     ]

@@ -61,6 +61,7 @@ flags.DEFINE_boolean("peak", True, "Also measure the peak of matrix products, wh
 flags.DEFINE_list(
     "parts", list(measure_gpu.PARTS), f"Parts of the suite gpu, made in this order: {', '.join(measure_gpu.PARTS)}."
 )
+flags.DEFINE_float("patience", 1.0, "Factor of the limits of time of these parts, for a slow machine.", lower_bound=0.0)
 define_path("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list(
     "compare", [], f"Other implementations to measure, interleaved with ours: {', '.join(compare.NEEDS)}."
@@ -191,6 +192,7 @@ def request() -> Request:
         capacities=[int(value) for value in FLAGS.capacities],
         profile=FLAGS.profile,
         parts=FLAGS.parts,
+        patience=FLAGS.patience,
         compare=FLAGS.compare,
         peer_python=FLAGS.peer_python,
     )

@@ -1,7 +1,8 @@
 """Whether training repeats bit for bit, and resumes bit for bit from a checkpoint, in processes of their own.
 
 `compare` starts `python -m experiments.benchmarks.exact_resume ALGO TASK PHYSICS MEMBERS STEPS FOLDER HOW` three times:
-two complete trainings, and one that continues the first one's checkpoint. Each prints a sum of every array at the end.
+two complete trainings, and one that continues the first one's checkpoint. Each compiles anew, because XLA may choose
+other kernels each time, and prints a sum of every array at the end.
 """
 
 import hashlib
@@ -106,6 +107,7 @@ def compare(
 if __name__ == "__main__":
     jax_settings.prepare()
     jax_settings.start_jax(1)
+    jax.config.update("jax_enable_compilation_cache", False)
     simulators.LACKS.clear()  # the command that started this has asked
     _, algo, task, physics, members, steps, folder, how = sys.argv
     print(json.dumps(train_and_sum(algo, task, physics, int(members), int(steps), Path(folder), how)))

@@ -34,6 +34,7 @@ class Request(NamedTuple):
     capacities: Sequence[int]
     profile: bool
     parts: Sequence[str]  # of the suite gpu
+    patience: float
     compare: Sequence[str]
     peer_python: str
 
@@ -99,7 +100,7 @@ def _suites(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
 def _gpu(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
     if "gpu" in request.suites:
         parts = measure_gpu.parts_of(request.parts, request.tasks[0], request.members, request.physics, **timing)
-        yield "gpu", measure_gpu.bench_gpu(parts)
+        yield "gpu", measure_gpu.bench_gpu(parts, request.patience)
 
 
 def _growth(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
