@@ -1,6 +1,7 @@
 """Shared by all tests: the cache of compiled programs, hypothesis' profile, strict promotion."""
 
 import functools
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +11,21 @@ ROOT = Path(__file__).resolve().parent.parent
 # Before JAX is imported, and through the environment, so that processes started by tests share the cache.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-# Most of a test's time is compilation, and this halves it: no optimisation, and no parallel compilation, because
-# two test processes keep the cores busy. `make test-all` sets XLA_FLAGS to nothing: programs as users compile them.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
+# Most of a test's time is compilation, and this makes it a quarter: no optimisation, the emitters of kernels that
+# compile in half the time, and no parallel compilation, because two test processes keep the cores busy. `make test-all`
+# sets XLA_FLAGS to nothing: programs as users compile them.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+)
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from forked_commands import ForkedCommands  # noqa: E402
 
 jax.config.update("jax_num_cpu_devices", 2)  # sweeps are tested over two devices too
+gc.set_threshold(100_000, 50, 100)  # tracing makes many objects that live long: collecting often is a sixth of its time
 
 # No deadline: the first example of a property compiles it. Derandomised: a run is repeatable.
 hypothesis.settings.register_profile("sqt_jax", deadline=None, max_examples=40, derandomize=True)
@@ -72,6 +79,13 @@ def _room_for_programs() -> Iterator[None]:
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_text().count("\n") > 30_000:
         jax.clear_caches()
+
+
+@pytest.fixture(scope="session")
+def commands() -> Iterator[ForkedCommands]:
+    """Runs commands of `experiments` in processes that share their imports: `commands.run("sweep", "--help")`."""
+    with ForkedCommands() as server:
+        yield server
 
 
 @pytest.fixture(params=["eager", "jit"])

@@ -113,13 +113,8 @@ def test_a_flag_error_exits_with_its_line_before_anything_runs():
         bench.main(["bench"])
 
 
-def test_help_lists_the_flags():
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.bench", "--help"],
-        cwd=Path(__file__).parent.parent,
-        capture_output=True,
-        text=True,
-    )
+def test_help_lists_the_flags(commands):
+    done = commands.run("bench", "--help")
     assert "Suites:\n" in done.stdout and "  --suites: What to measure" in done.stdout
 
 

@@ -60,6 +60,7 @@ def test_an_episode_ends_with_its_own_observation_and_the_next_has_a_new_start(p
     assert np.abs(np.array(starts)).max() <= 0.05
 
 
+@pytest.mark.slow  # as above
 def test_the_time_limit_truncates(pendulum):
     env, step = pendulum
     timestep = env.reset(jax.random.key(0))

@@ -335,8 +335,11 @@ def test_a_folder_that_cannot_be_written_is_rejected(tmp_path, capsys):
     assert err.startswith(f"--out={tmp_path / 'file'}: expects a folder that can be written") and err.count("\n") == 1
 
 
-def test_the_command_itself(tmp_path):
+@pytest.mark.parametrize("physics", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_the_command_itself(tmp_path, physics):
+    """The default physics, mjx, takes long to compile."""
     command = [sys.executable, "-m", "experiments.run", "--algo=sac_sqt", "--env=cheetah", "--seeds=0,1"]
+    command += [] if physics == "mjx" else [f"--physics={physics}"]
     done = subprocess.run([*command, *SMALL.split(), f"--out={tmp_path}"], capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")
     path = tmp_path / "cheetah" / "sac_sqt" / "run"

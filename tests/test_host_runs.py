@@ -68,7 +68,7 @@ def test_a_run_its_tables_its_report_and_its_film(folder, tmp_path, capsys):
     assert (tmp_path / "film.gif").exists()
 
 
-@pytest.mark.parametrize(("devices", "saved"), [(1, 136), (2, 100)])
+@pytest.mark.parametrize(("devices", "saved"), [(1, 136), pytest.param(2, 100, marks=pytest.mark.slow)])
 def test_an_exception_ends_the_run_with_its_error_and_a_checkpoint(folder, capsys, devices, saved):
     """On one device of the step before; on several, members stop at different steps: the last one."""
     assert run_tiny("--name=a", "--env_args=fails_at=137", f"--devices={devices}") == 1

@@ -127,12 +127,13 @@ def test_a_diverged_robot_ends_its_episode_and_no_other(fault, tmp_path, monkeyp
     timestep = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
     qvel = timestep.state.task.qvel.at[1, 2].set(fault)
     broken = jax.vmap(env.set_physics)(timestep.state.task.qpos, qvel)
-    after = jax.jit(jax.vmap(env.step))(broken, jnp.zeros((3, 8)))
+    step = jax.jit(jax.vmap(env.step))
+    after = step(broken, jnp.zeros((3, 8)))
     assert after.terminated.tolist() == [False, True, False]
     assert all(np.all(np.isfinite(x)) for x in (after.obs, after.reward, after.final_obs[jnp.array([0, 2])]))
     assert after.reward[1] == 0
     assert jax.vmap(env.status)(after)["unstable_steps"].tolist() == [0, 1, 0]
-    going_on = jax.jit(jax.vmap(env.step))(after, jnp.zeros((3, 8)))
+    going_on = step(after, jnp.zeros((3, 8)))
     assert np.all(np.isfinite(going_on.final_obs)) and not going_on.terminated.any()
     assert list(tmp_path.iterdir()) == []  # MuJoCo wrote no log
     assert capfd.readouterr().err == ""

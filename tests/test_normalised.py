@@ -313,5 +313,5 @@ def test_a_task_in_another_unit_is_learned_with_it_and_not_without(scale):
 
 def test_the_library_has_it_too():
     agent = make_agent("td3", O, A, hidden=(8, 8), normalize_observations=True)
-    state = agent.see(agent.init(KEY), SEEN)
-    assert agent.act(state, SEEN, KEY).shape == (3, A) and state.statistics.seen == 3
+    state = jax.jit(lambda: agent.see(agent.init(KEY), SEEN))()
+    assert jax.jit(agent.act)(state, SEEN, KEY).shape == (3, A) and state.statistics.seen == 3

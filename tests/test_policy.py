@@ -25,8 +25,8 @@ def saved(algo, directory, members=2, **settings):
     env = probe_envs.constant_reward()
     config = experiment.make_config(algo, "cheetah", hidden=(8, 8), **settings)
     agent = experiment.agent_of(config, env)
-    state = jax.vmap(agent.init)(jax.random.split(jax.random.key(1), members))
-    state = jax.vmap(agent.see)(state, jnp.arange(6.0 * members).reshape(members, 3, 2))
+    state = jax.jit(jax.vmap(agent.init))(jax.random.split(jax.random.key(1), members))
+    state = jax.jit(jax.vmap(agent.see))(state, jnp.arange(6.0 * members).reshape(members, 3, 2))
     if settings.get("normalize_observations") and algo.startswith("td7"):  # the saved policy is the checkpoint
         moments = state.learner.statistics.moments
         policies = state.checkpoints.checkpoint._replace(moments=moments)
@@ -39,7 +39,7 @@ CHANGED = {f"{algo} released": preset_settings("released", algo, "cheetah") for 
 CHANGED |= {f"{algo} normalised": {"normalize_observations": True} for algo in ("td3", "sac", "td7")}
 
 
-@algorithm_rows.every([*ALGORITHMS, *CHANGED], fast=("td3", "sac", "td7_sqt", "sac released", "td7 normalised"))
+@algorithm_rows.every([*ALGORITHMS, *CHANGED], fast=("td3", "td7_sqt", "sac released"))
 def test_a_loaded_policy_gives_the_members_actions(algo, tmp_path):
     agent, state = saved(algo.split()[0], tmp_path / "policy", **CHANGED.get(algo, {}))
     obs = jnp.linspace(-1, 1, 6).reshape(3, 2)
@@ -306,7 +306,7 @@ assert "sqt_jax" not in sys.modules and "flax" not in sys.modules
 """
 
 
-@pytest.mark.parametrize("algo", ["td3", "sac_sqt", "td7", pytest.param("sac normalised", marks=pytest.mark.slow)])
+@algorithm_rows.every(["td3", "sac_sqt", "td7", "sac normalised"], fast=("td3", "td7"))
 def test_the_exported_policy_runs_without_this_package(algo, tmp_path):
     saved(algo.split()[0], tmp_path / "policy", **CHANGED.get(algo, {}))
     subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=tmp_path, check=True, timeout=120)

@@ -47,7 +47,7 @@ def marked(mark):
     return "\n".join(code for blocks in BLOCKS.values() for _, own, code in blocks if own == mark)
 
 
-def commands(text):
+def commands_in(text):
     """The command lines in a text that start a module of `experiments`: its name, then the arguments."""
     found = []
     for line in text.replace("\\\n", " ").splitlines():
@@ -66,7 +66,9 @@ def places(words):
 
 
 PYTHON = programs()
-SHELL = [argv for page in PAGES for argv in commands("\n".join(code for kind, _, code in BLOCKS[page] if kind == "sh"))]
+SHELL = [
+    argv for page in PAGES for argv in commands_in("\n".join(code for kind, _, code in BLOCKS[page] if kind == "sh"))
+]
 RUNS = [argv for argv in SHELL if argv[0] == "run"]
 SWEEPS = [argv for argv in SHELL if argv[0] == "sweep"]
 TUNES = [argv for argv in SHELL if argv[0] == "tune"]
@@ -97,7 +99,7 @@ def ids(argv):
     # The library guide's training runs are slow tests; the first page's example of one is not.
     [
         pytest.param(e, marks=pytest.mark.slow)
-        if name_of(e).endswith("README.md:make_environment") and "sqt" in e[0] or name_of(e).endswith(":make_config")
+        if re.search("^sqt_jax/.*:make_(agent|environment|config)$", name_of(e))
         else e
         for e in PYTHON
     ],
@@ -149,10 +151,9 @@ def test_commands_that_train_are_valid(argv, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("argv", SWEEPS, ids=ids)
-def test_commands_that_train_grids_are_valid(argv):
+def test_commands_that_train_grids_are_valid(argv, commands):
     """The sweep's own flags, then those passed on to `run`."""
-    command = [sys.executable, "-m", "experiments.sweep", *argv[1:], "--tasks=nowhere"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = commands.run(*argv, "--tasks=nowhere")
     assert done.returncode == 2 and done.stderr.startswith("--tasks: "), done.stderr
     text = "".join((ROOT / "experiments" / name).read_text() for name in ("sweep.py", "launchers/launcher_flags.py"))
     own = re.findall(r'(?:DEFINE_\w+|define_path)\("(\w+)"', text)
@@ -161,11 +162,10 @@ def test_commands_that_train_grids_are_valid(argv):
 
 
 @pytest.mark.parametrize("argv", TUNES, ids=ids)
-def test_commands_that_tune_are_valid(argv):
+def test_commands_that_tune_are_valid(argv, commands):
     """The command's own flags, then those of every run; the last word makes it refuse to start."""
     pytest.importorskip("optuna", reason="needs the extra tune")
-    command = [sys.executable, "-m", "experiments.tune", *argv[1:], "--launcher=none"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = commands.run(*argv, "--launcher=none")
     assert done.returncode == 2 and done.stderr.startswith("--launcher: "), done.stderr
 
 
@@ -212,14 +212,13 @@ def test_every_column_is_in_the_guide():
         assert set(path.read_text().split("\n")[0].split(",")) <= shown, path
 
 
-@functools.cache
-def help_of(command):
-    argv = [sys.executable, "-m", f"experiments.{command}", "--help"]
-    return subprocess.run(argv, cwd=ROOT, capture_output=True, text=True).stdout
+@pytest.fixture(scope="module")
+def help_of(commands):
+    return functools.cache(lambda command: commands.run(command, "--help").stdout)
 
 
 @pytest.mark.parametrize("argv", OTHERS, ids=ids)
-def test_flags_of_other_commands_exist(argv):
+def test_flags_of_other_commands_exist(argv, help_of):
     for word in argv[1:]:
         assert re.search(rf"^\s+{word.split('=')[0]}\b", help_of(argv[0]), re.MULTILINE), word
 
@@ -231,7 +230,7 @@ def test_every_command_shown_is_checked():
 
 def test_the_miniatures_commands_are_valid():
     made = subprocess.run(["make", "--dry-run", "miniature"], cwd=ROOT, capture_output=True, text=True, check=True)
-    found = commands(made.stdout)
+    found = commands_in(made.stdout)
     ((_, *sweep),) = (argv for argv in found if argv[0] == "sweep")
     rest = [word for word in sweep if not word.startswith(("--grid=", "--tasks="))]
     options = flags.parse(["run", "--algo=td3", "--env=ant", *rest])
@@ -290,12 +289,12 @@ row = lambda key, *shape: jax.random.uniform(key, (4, *shape))
 batch = sqt_jax.Transition(row(keys[0], 3), row(keys[1], 2), row(keys[2]), row(keys[3], 3), jnp.ones(4))
 errors = []
 for agent in agents.values():
-    errors.append(agent.update(agent.init(jax.random.key(1)), batch, keys[4], 0)[1])
+    errors.append(jax.jit(agent.update)(jax.jit(agent.init)(jax.random.key(1)), batch, keys[4], 0)[1])
 assert (errors[0] != errors[1]).all()
 assert sqt_jax.ALGORITHMS["td3_range"].baseline == "td3"
 assert sqt_jax.make_config("td3_range", "ant").agent.penalty_coef == 0.5
 median = sqt_jax.make_agent("td3", 3, 2, hidden=(8,), ensemble_size=3, reduce="median")
-assert median.update(median.init(jax.random.key(1)), batch, keys[4], 0)[1].shape == (4,)
+assert jax.jit(median.update)(jax.jit(median.init)(jax.random.key(1)), batch, keys[4], 0)[1].shape == (4,)
 """
     python_in(extended, code)
 

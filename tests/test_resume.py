@@ -79,7 +79,7 @@ def interrupted(out, monkeypatch, at, *more, by=signal.SIGTERM):
 @pytest.mark.parametrize(
     ("at", "by"),
     [
-        (0, signal.SIGINT),
+        pytest.param(0, signal.SIGINT, marks=pytest.mark.slow),
         pytest.param(20, signal.SIGTERM, marks=pytest.mark.slow),
         (50, signal.SIGTERM),
         (80, signal.SIGINT),
@@ -101,7 +101,8 @@ def test_an_interrupted_run_ends_like_a_run_without_a_break(tmp_path, monkeypatc
     assert [entry["env_steps"] for entry in config["resumed"]] == [at]
 
 
-@pytest.mark.parametrize("at", [pytest.param(20, marks=pytest.mark.slow), 80])
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [20, 80])
 def test_the_statistics_of_observations_are_resumed(tmp_path, monkeypatch, at):
     """In the warm-up and in training."""
     assert run(tmp_path / "unbroken", *MEMBERS, "--normalize_observations") == 0
@@ -157,16 +158,16 @@ def test_a_diverged_member_stays_diverged(tmp_path, capsys):
     first = json.loads((path_in(tmp_path) / "summary.json").read_text())["diverged"]
     assert [entry["member"] for entry in first] == [2, 3]
     capsys.readouterr()
-    assert resumed(tmp_path, "--steps=150") == 3
+    assert resumed(tmp_path, "--steps=200") == 3
     summary = json.loads((path_in(tmp_path) / "summary.json").read_text())
     assert summary["diverged"] == first and summary["status"] == "diverged"
     assert "diverged at" not in capsys.readouterr().out  # it was reported before
-    late = [row for row in rows_of(path_in(tmp_path) / "evaluations.csv") if row["env_steps"] == "150"]
+    late = [row for row in rows_of(path_in(tmp_path) / "evaluations.csv") if row["env_steps"] == "200"]
     assert [row["return_mean"] for row in late] == ["5.0", "5.0", "", ""]
 
 
 def test_a_run_without_checkpoints_is_rejected_and_not_changed(tmp_path, capsys):
-    assert run(tmp_path, "--checkpoint_every=0") == 0
+    assert run(tmp_path, *MEMBERS, "--checkpoint_every=0") == 0
     assert not (path_in(tmp_path) / "checkpoint").exists()
     before = content(tmp_path)
     capsys.readouterr()
@@ -267,7 +268,7 @@ def test_a_resumed_run_has_no_summary_until_it_ends(tmp_path, monkeypatch):
         return loop.train_loop(*arguments, **options)
 
     monkeypatch.setattr(session, "train_loop", looked_at)
-    assert resumed(tmp_path, "--steps=140", "--keep_checkpoints=3") == 0
+    assert resumed(tmp_path, "--steps=200", "--keep_checkpoints=3") == 0
     assert seen == [[]]  # until then the policies are the checkpoints'
     assert json.loads((path_in(tmp_path) / "config.json").read_text())["output"]["keep_checkpoints"] == 3
 

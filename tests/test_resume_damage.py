@@ -11,7 +11,7 @@ import pytest
 from experiments.run import main
 from experiments.running import manifests
 
-pytestmark = pytest.mark.usefixtures("tiny_tasks")
+pytestmark = pytest.mark.usefixtures("shared_programs", "tiny_tasks")
 
 NEW = (
     "--algo=sac_sqt --env=ant --seeds=3,1 --steps=60 --warmup_steps=20 --eval_every=30 --eval_episodes=1 "

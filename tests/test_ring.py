@@ -177,11 +177,11 @@ def test_members_have_their_own_of_every_field_except_the_number_of_inserted_tra
     assert axes.inserted is None and set(axes._replace(inserted=0)) == {0}
     streams, alone = (Stream(num_envs), Stream(num_envs)), [ring.init(), ring.init()]
     together = jax.vmap(lambda _: ring.init(), out_axes=axes)(jnp.arange(2))
-    insert = jax.jit(jax.vmap(ring.insert, (axes, 0), (axes, 0)))
+    insert, insert_alone = jax.jit(jax.vmap(ring.insert, (axes, 0), (axes, 0))), jax.jit(ring.insert)
     for _ in range(CAPACITY + 3):
         steps = [stream.step(np.full(num_envs, ends)) for stream, ends in zip(streams, (True, False), strict=True)]
         together, _ = insert(together, jax.tree.map(lambda *leaves: np.stack(leaves), *steps))
-        alone = [ring.insert(state, step)[0] for state, step in zip(alone, steps, strict=True)]
+        alone = [insert_alone(state, step)[0] for state, step in zip(alone, steps, strict=True)]
     assert together.inserted.shape == () and together.num_finals.tolist() == [num_envs * (CAPACITY + 2), 0]
     for member, state in enumerate(alone):
         of_member = jax.tree.map(

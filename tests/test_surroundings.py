@@ -128,43 +128,47 @@ LARGE = f"{TRAIN} --eval_every=1000000 --replay_capacity=2000000000 --steps=1000
 # Refused in one line, or done without training.
 ROWS = [
     Row("no such platform", TRAIN, "JAX_PLATFORMS=cuda: expects a platform", 2, {"JAX_PLATFORMS": "cuda"}),
-    Row("no platform at all", TRAIN, "JAX_PLATFORMS=banana: expects a platform", 2, {"JAX_PLATFORMS": "banana"}),
     Row("debug_nans", TRAIN, "JAX_DEBUG_NANS: expects it to be off", 2, {"JAX_DEBUG_NANS": "1"}),
-    Row("debug_infs", TRAIN, "JAX_DEBUG_INFS: expects it to be off", 2, {"JAX_DEBUG_INFS": "true"}),
-    Row("no jit", TRAIN, "JAX_DISABLE_JIT: expects it to be off", 2, {"JAX_DISABLE_JIT": "1"}),
-    Row("a switch that is no switch", TRAIN, "JAX_ENABLE_X64", 2, {"JAX_ENABLE_X64": "banana"}),
     Row("nobody's home as --out", "run $TINY --out=~nobody_here/runs", "--out=~nobody_here/runs: expects", 2),
-    Row("nobody's home as --config", "run --config=~nobody_here/a.yaml", "--config=~nobody_here/a.yaml: expects", 2),
-    Row("nobody's home as RUNS", "\"$PYTHON\" -m experiments.tables '~nobody_here/a'", "expects a folder", 2),
     Row("no home for --out", "run $TINY --out=~/runs", "--out=~/runs: expects", 2, {"HOME": None}, NO_USER),
     Row("stand-in: memory of an outer control group", LARGE, "under memory.max of the control group job_7", 2,
         python=V2_NESTED),  # fmt: skip
-    Row("stand-in: memory of a control group, version 1", LARGE, "under memory.limit_in_bytes", 2, python=V1),
     Row("ulimit -v", f"ulimit -v 9000000; {LARGE}00", "under ulimit -v", 2),
-    Row("ulimit -d", f"ulimit -d 9000000; {LARGE}00", "under ulimit -d", 2),
-    Row("options of Python", "\"$PYTHON\" -um experiments.run --stepz=1", "did you mean --steps", 2),
     Row("no space after -m", "\"$PYTHON\" -Xutf8 -mexperiments.run --stepz=1", "did you mean --steps", 2),
     Row("a module of one's own", "mkdir mine; echo 'import experiments' > mine/__init__.py; "
         "echo 'import os; print(os.environ[\"MUJOCO_GL\"])' > mine/train.py; \"$PYTHON\" -m mine.train", "egl", 0,
         {"MUJOCO_GL": "egl"}),  # fmt: skip
-    Row("an unknown MUJOCO_GL", "play $RESULTS", "expects a run with policy/", 2, {"MUJOCO_GL": "banana"}),
     Row("a folder that is not UTF-8", "run $TINY --out=$'caf\\xe9'", "expects a folder whose whole path is UTF-8", 2),
-    Row("a sweep into a folder that cannot be", "\"$PYTHON\" -m experiments.sweep --grid=table2 --out=/proc/x",
-        "--out=/proc/x: expects a folder that can be written", 2),  # fmt: skip
     Row("stdout is full", "tables > /dev/full", "could not be written: No space left", 1),
-    Row("stderr is full", "run --stepz=1 2> /dev/full", "", 2),
-    Row("stdout is closed", "tables >&-", "", 0),
     Row("all streams are closed", "tables <&- >&- 2>&-", "", 0),
     Row("the reader of stdout leaves", "tables | true; exit ${PIPESTATUS[0]}", "", 0, never="rror"),
-    Row("ASCII, in a locale that is not there", "tables", "95 %", 0,
-        {"PYTHONIOENCODING": "ascii", "LC_ALL": "xx_XX.UTF-8"}),  # fmt: skip
     Row("ASCII in files", "tables --out=$OUT", "95 %", 0,
         {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),  # fmt: skip
-    Row("20 columns in a pipe", "tables | cat", "by seed   at the last one", 0, {"COLUMNS": "20"}, never="…"),
     Row("colours, and warnings that are errors", "tables | cat", "95 %", 0,
         {"FORCE_COLOR": "1", "TERM": "dumb", "PYTHONWARNINGS": "error"}, never="\x1b"),  # fmt: skip
     Row("a notebook's matplotlib", "plots", "learning_curves.png", 0,
         {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}),  # fmt: skip
+]  # fmt: skip
+
+# The same, each much like one of `ROWS`: slow tests.
+ALIKE = [
+    Row("no platform at all", TRAIN, "JAX_PLATFORMS=banana: expects a platform", 2, {"JAX_PLATFORMS": "banana"}),
+    Row("debug_infs", TRAIN, "JAX_DEBUG_INFS: expects it to be off", 2, {"JAX_DEBUG_INFS": "true"}),
+    Row("no jit", TRAIN, "JAX_DISABLE_JIT: expects it to be off", 2, {"JAX_DISABLE_JIT": "1"}),
+    Row("a switch that is no switch", TRAIN, "JAX_ENABLE_X64", 2, {"JAX_ENABLE_X64": "banana"}),
+    Row("nobody's home as --config", "run --config=~nobody_here/a.yaml", "--config=~nobody_here/a.yaml: expects", 2),
+    Row("nobody's home as RUNS", "\"$PYTHON\" -m experiments.tables '~nobody_here/a'", "expects a folder", 2),
+    Row("stand-in: memory of a control group, version 1", LARGE, "under memory.limit_in_bytes", 2, python=V1),
+    Row("ulimit -d", f"ulimit -d 9000000; {LARGE}00", "under ulimit -d", 2),
+    Row("options of Python", "\"$PYTHON\" -um experiments.run --stepz=1", "did you mean --steps", 2),
+    Row("an unknown MUJOCO_GL", "play $RESULTS", "expects a run with policy/", 2, {"MUJOCO_GL": "banana"}),
+    Row("a sweep into a folder that cannot be", "\"$PYTHON\" -m experiments.sweep --grid=table2 --out=/proc/x",
+        "--out=/proc/x: expects a folder that can be written", 2),  # fmt: skip
+    Row("stderr is full", "run --stepz=1 2> /dev/full", "", 2),
+    Row("stdout is closed", "tables >&-", "", 0),
+    Row("ASCII, in a locale that is not there", "tables", "95 %", 0,
+        {"PYTHONIOENCODING": "ascii", "LC_ALL": "xx_XX.UTF-8"}),  # fmt: skip
+    Row("20 columns in a pipe", "tables | cat", "by seed   at the last one", 0, {"COLUMNS": "20"}, never="…"),
     Row("a matplotlibrc with LaTeX", "echo 'text.usetex: True' > rc; plots", "learning_curves.png", 0,
         {"MATPLOTLIBRC": "rc", "MPLBACKEND": "tkagg"}),  # fmt: skip
 ]  # fmt: skip
@@ -278,7 +282,9 @@ def undisturbed(tmp_path_factory):
     return table(folder)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+@pytest.mark.parametrize(
+    "row", [*ROWS, *(pytest.param(row, marks=pytest.mark.slow) for row in ALIKE)], ids=lambda row: row.name
+)
 def test_a_command_ends_as_it_should(row, tmp_path):
     done = in_surroundings(row, tmp_path, timeout=60)
     check(row, done)

@@ -30,33 +30,30 @@ from made_runs import write_run
         ("--grid=table2 --tasks=ant --stepz=4", "--stepz: unknown flag; did you mean --steps?"),
     ],
 )
-def test_the_command_rejects_in_one_line(tmp_path, arguments, line):
-    command = [sys.executable, "-m", "experiments.sweep", f"--out={tmp_path / 'out'}", *arguments.split()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+def test_the_command_rejects_in_one_line(tmp_path, commands, arguments, line):
+    done = commands.run("sweep", f"--out={tmp_path / 'out'}", *arguments.split())
     assert done.returncode == 2
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists() or not any(path.is_dir() for path in (tmp_path / "out").glob("*/*/*"))
 
 
-COMMAND = [sys.executable, "-m", "experiments.sweep", "--algos=td3,td3_sqt", "--tasks=ant", "--steps=10"]
+COMMAND = ["sweep", "--algos=td3,td3_sqt", "--tasks=ant"]
 
 
-def test_dry_run_prints_a_command_per_run_that_is_not_finished(tmp_path):
+def test_dry_run_prints_a_command_per_run_that_is_not_finished(tmp_path, commands):
     write_run(tmp_path, "td3", "ant", name="steps=10")
     (tmp_path / "ant" / "td3" / "steps=10" / "summary.json").write_text('{"status": "done"}')
-    done = subprocess.run(
-        [*COMMAND, f"--out={tmp_path}", "--dry_run"], capture_output=True, text=True, timeout=120, check=True
-    )
+    done = commands.run(*COMMAND, "--steps=10", f"--out={tmp_path}", "--dry_run")
+    assert done.returncode == 0, done.stderr
     assert shlex.split(done.stdout) == [
         *("python", "-m", "experiments.run", "--algo=td3_sqt", "--env=ant"),
         *(f"--out={tmp_path}", "--name=steps=10", "--resume", "--steps=10"),
     ]
 
 
-def test_status_of_a_grid_that_has_not_begun(tmp_path):
-    done = subprocess.run(
-        [*COMMAND, f"--out={tmp_path / 'new'}", "--status"], capture_output=True, text=True, timeout=120, check=True
-    )
+def test_status_of_a_grid_that_has_not_begun(tmp_path, commands):
+    done = commands.run(*COMMAND, "--steps=10", f"--out={tmp_path / 'new'}", "--status")
+    assert done.returncode == 0, done.stderr
     assert done.stdout == "td3 on ant      waiting\ntd3_sqt on ant  waiting\n2 runs: 2 waiting\n"
     assert not any(tmp_path.iterdir())
 
@@ -66,7 +63,8 @@ def test_ctrl_c_saves_every_running_cell_and_the_same_command_ends_the_grid(tmp_
     words = (
         "--physics=mujoco --seeds=0,1 --steps=30000 --warmup_steps=100 --eval_every=1000 --eval_episodes=1 --hidden=8"
     )
-    command = [*COMMAND[:-1], *words.split(), f"--out={tmp_path}", "--batch_size=8"]
+    command = [sys.executable, "-m", f"experiments.{COMMAND[0]}", *COMMAND[1:], *words.split()]
+    command += [f"--out={tmp_path}", "--batch_size=8"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     tables = [tmp_path / "ant" / algo / "*" / "evaluations.csv" for algo in ("td3",)]
     give_up = time.monotonic() + 300
@@ -82,7 +80,6 @@ def test_ctrl_c_saves_every_running_cell_and_the_same_command_ends_the_grid(tmp_
     assert "td3 on ant      interrupted" in shown and "td3_sqt on ant  waiting" in shown
 
 
-def test_help_says_that_other_flags_go_to_every_run():
-    command = [sys.executable, "-m", "experiments.sweep", "--help"]
-    out = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+def test_help_says_that_other_flags_go_to_every_run(commands):
+    out = commands.run("sweep", "--help").stdout
     assert "--grid" in out and "to every run, for example --steps=1000000" in " ".join(out.split())

@@ -86,7 +86,7 @@ def test_a_grid_is_trained_once(tmp_path):
 
 
 def test_an_interrupted_cell_is_resumed(tmp_path, monkeypatch):
-    (cell, *_) = cells_of(GRID, (), (), tmp_path, [*TINY.split(), "--checkpoint_every=20"])
+    (cell,) = cells_of(Grid(("td3_sqt",), ("ant",)), (), (), tmp_path, [*TINY.split(), "--checkpoint_every=20"])
     lines = []
 
     def stopped(*arguments, stop, **options):

@@ -80,7 +80,6 @@ def test_a_typing_error_is_reported_without_heavy_imports():
     assert done.stdout == "[]\n"
 
 
-def test_the_command_names_a_flag_with_a_wrong_value():
-    command = [sys.executable, "-m", "experiments.tune", "--batch=0", "--algo=td3_sqt"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+def test_the_command_names_a_flag_with_a_wrong_value(commands):
+    done = commands.run("tune", "--batch=0", "--algo=td3_sqt")
     assert (done.returncode, done.stderr) == (2, "--batch: expects an integer in the range [1, 5000]\n")
