@@ -159,8 +159,8 @@ def _run_pip(command: Sequence[str]) -> None:
         raise UsageError(f"pip: {errors[-1].removeprefix('ERROR: ')}")
 
 
-def main(argv: Sequence[str]) -> int:
-    """The two commands; returns the exit code."""
+def parser() -> argparse.ArgumentParser:
+    """The two commands' arguments."""
     parser = argparse.ArgumentParser("python -m experiments.benchmarks.gpu_bundle", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True)
     packing = commands.add_parser("pack", help="download the wheels and cut them into numbered folders")
@@ -169,7 +169,12 @@ def main(argv: Sequence[str]) -> int:
     unpacking = commands.add_parser("unpack", help="check, join and install them")
     unpacking.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     unpacking.add_argument("site", type=Path, metavar="SITE")
-    options = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: Sequence[str]) -> int:
+    """The two commands; returns the exit code."""
+    options = parser().parse_args(argv)
     target = options.folder if options.command == "pack" else options.site
     try:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
