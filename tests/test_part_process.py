@@ -1,6 +1,7 @@
 """A part in a process of its own: its results arrive while it runs, and whatever ends it is one line."""
 
 import os
+import subprocess
 import sys
 import time
 
@@ -40,6 +41,19 @@ def test_a_part_that_fails_says_why():
     assert list(run("import sys; sys.exit('first\\nlast')")) == [Failure("the part", "last")]
     assert list(run("import os; os.abort()"))[0].why == "signal 6, without an error"
     assert list(run(f"print({line(FOUND)!r})")) == [FOUND]
+
+
+def test_a_killed_benchmark_leaves_no_process():
+    part = "import os, time; from experiments.benchmarks import part_process as p; p.end_with_parent(0.1); "
+    part += "print(os.getpid(), flush=True); time.sleep(60)"
+    program = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', sys.argv[1]], start_new_session=True); "
+    program += "import time; time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", program, part], stdout=subprocess.PIPE, text=True) as benchmark:
+        assert int(benchmark.stdout.readline()) > 0  # the part is alive
+        benchmark.kill()
+        began = time.monotonic()
+        assert benchmark.stdout.read() == ""  # returns when the part, which has the other end, has ended
+        assert time.monotonic() - began < 30
 
 
 def test_xlas_fatal_message_is_the_reason_not_its_stack():

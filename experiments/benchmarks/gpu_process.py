@@ -82,4 +82,5 @@ def main(kind: str, arguments: str) -> None:
 
 
 if __name__ == "__main__":
+    part_process.end_with_parent()
     main(*sys.argv[1:])
