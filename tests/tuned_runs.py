@@ -67,7 +67,8 @@ def write_cell(cell):
     content = json.loads((path / "config.json").read_text())
     (path / "config.json").write_text(json.dumps(content | {"output": {"tuned": flags.get("tuned", "")}}))
     diverged = bool(np.isnan(curves).any())
-    (path / "summary.json").write_text(json.dumps({"status": "diverged" if diverged else "done"}))
+    summary = {"status": "diverged" if diverged else "done", "groups": [], "diverged": []}
+    (path / "summary.json").write_text(json.dumps(summary))
     return DIVERGED if diverged else DONE
 
 
