@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 
 from experiments.commandline.arguments import DIVERGED, DONE, FAILED, INTERRUPTED, printable
 from experiments.launchers import tied
-from experiments.launchers.cell import Cell, Ended, write_ended
+from experiments.launchers.cell import INTERRUPTED_TEXT, Cell, Ended, write_ended
 
 TAIL_BYTES = 10_000
 MAX_REASON = 500
-WORDS = {INTERRUPTED: "interrupted; the same command resumes it", DONE: "", DIVERGED: ""}
+WORDS = {INTERRUPTED: INTERRUPTED_TEXT, DONE: "", DIVERGED: ""}
 
 
 class CellProcess:

@@ -9,6 +9,7 @@ from pathlib import Path
 from experiments.commandline.arguments import BAD_USAGE, FAILED, INTERRUPTED, UsageError, printable
 from experiments.launchers import slurm_options, slurm_queue, slurm_records
 from experiments.launchers.cell import Cell, Ended, read_ended
+from experiments.launchers.node_check import not_shared
 from experiments.launchers.slurm_queue import CommandError, Job
 from experiments.launchers.slurm_records import Submitted
 from experiments.launchers.slurm_submission import Submission, submit_array
@@ -157,8 +158,7 @@ def outcome(cell: Cell, job: Job | None, submitted: Submitted, out: Path, waited
         return None
     if lines is None:
         node = job.node if job and job.node != "n/a" else "the job's machine"
-        text = f"--out={out}: expects a folder that all machines share; {node} does not see it"
-        return Ended(cell, BAD_USAGE, f"{text} (job {submitted.job}: {state})")
+        return Ended(cell, BAD_USAGE, f"{not_shared(str(out), node)} (job {submitted.job}: {state})")
     last = lines[-1] if lines else "it printed nothing"
     return Ended(cell, FAILED, f"job {submitted.job} was lost ({state}): {last}", lost=True)
 
