@@ -373,6 +373,18 @@ def test_the_holder_of_a_folder_is_read_without_its_lock(tmp_path, hold, monkeyp
         assert folder_lock.holder(tmp_path / "run").alive is alive
 
 
+def test_a_holder_of_this_host_that_was_killed_is_not_alive(tmp_path, hold):
+    process = hold()
+    assert folder_lock.holder(tmp_path / "run").alive is True
+    process.kill()  # nobody has waited for it yet: its number is still taken
+    give_up = time.monotonic() + 30
+    while folder_lock.holder(tmp_path / "run").alive and time.monotonic() < give_up:
+        time.sleep(0.01)
+    assert folder_lock.holder(tmp_path / "run").alive is False
+    process.wait()
+    assert folder_lock.holder(tmp_path / "run").alive is False
+
+
 def test_nobody_holds_a_released_or_empty_lock(tmp_path):
     with locked(tmp_path):
         assert folder_lock.holder(tmp_path).process == os.getpid()

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from experiments.commandline.arguments import INTERRUPTED, UsageError
+from experiments.commandline.arguments import FAILED, INTERRUPTED, UsageError
 from experiments.launchers.cell import Cell, Ended
 from experiments.launchers.local import LocalLauncher, Share, shares, visible_gpus
 
@@ -93,6 +93,22 @@ def test_cells_run_side_by_side_each_on_a_free_share():
         assert [ended.code for ended in launcher.ended()] == [1]
         assert launcher.ended() == []
     assert not any(process.signals for process in Process.started)
+
+
+def test_a_cell_that_cannot_be_started_fails_and_the_others_go_on():
+    def start(cell, cores, variables):
+        if cell == CELLS[0]:
+            raise IsADirectoryError(21, "Is a directory", "a.log.txt")
+        return Process(cell, cores, variables)
+
+    with LocalLauncher([Share((0,))], start) as launcher:
+        launcher.submit(CELLS[:2])
+        failed = Ended(CELLS[0], FAILED, "cannot be started: [Errno 21] Is a directory: 'a.log.txt'")
+        (process,) = Process.started
+        process.code = 0
+        assert launcher.ended() == [failed] and launcher.ended() == [Ended(CELLS[1], 0, "")]
+        launcher.submit(CELLS[:1])
+        assert launcher.ended() == [failed]
 
 
 def test_cancel_asks_the_running_ones_and_drops_the_waiting_ones():

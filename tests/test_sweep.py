@@ -28,6 +28,8 @@ from made_runs import write_run
             "--grid=table2 --name=x",
             "--name=x: expects flags of experiments.run in the form --flag=value, except --algo",
         ),
+        ("--grid=table2 --max_jobs=2 --dry_run", "--max_jobs: has no effect with --launcher=local; expects slurm"),
+        ("--grid=table2 --launcher=slurm --detach --retries=2", "--retries: has no effect with --detach; expects "),
         ("--grid=table2 --tasks=ant --stepz=4", "--stepz: unknown flag; did you mean --steps?"),
     ],
 )

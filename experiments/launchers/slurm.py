@@ -18,7 +18,7 @@ POLL_SECONDS = 5.0  # between two questions to SLURM, one for all jobs
 SHARING_SECONDS = 15.0  # a shared folder may show a new file that much later
 STOP_SIGNAL = "USR1"  # a job that gets it saves and ends
 TAIL_BYTES = 2_000
-REFUSALS = ("--out=", "--launcher=")  # how lines begin in which a job refuses to train
+REFUSALS = ("--out=", "--launcher=", "--name=", "--resume=")  # how lines begin in which a job or its run refuses
 
 
 class SlurmLauncher:
@@ -49,8 +49,10 @@ class SlurmLauncher:
         """As `Launcher.submit`. After the first call, cells that cannot be submitted are lost; the others go on."""
         try:
             self._submit(cells)
-        except (UsageError, CommandError) as error:
+        except (UsageError, CommandError, OSError) as error:
             if not self._submitted:
+                if isinstance(error, OSError):
+                    raise
                 raise UsageError(f"{'' if isinstance(error, UsageError) else '--launcher=slurm: '}{error}") from None
             self._refused += [Ended(cell, FAILED, str(error), lost=True) for cell in cells if cell not in self._jobs]
         self._submitted = True

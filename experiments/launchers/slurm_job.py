@@ -72,6 +72,8 @@ class CellJob(NamedTuple):
                 if number == signal.SIGTERM and not job.still_runs():
                     # SLURM may kill the run before it has saved. That it was asked to is known then.
                     write_ended(Ended(self.cell, INTERRUPTED, INTERRUPTED_TEXT, lost=True))
+        if ended.code == BAD_USAGE:
+            print(ended.reason, file=sys.stderr)  # the sweep reads it here if the run belongs to another process
         sys.exit(self._after(ended, set(received), job))
 
     def _after(self, ended: Ended, received: set[int], job: "ThisJob") -> int:
