@@ -12,6 +12,7 @@ Suites:
   batches     whole runs: all members in one process, and in 8 processes side by side
   kernels     what a GPU would launch in a lockstep step, by part of the step: compiled for one that is not there
   starts      whole seconds of a run of two steps, with an empty compilation cache and with a filled one
+  gpu         all to be known about a GPU, most telling first, each part in a process of its own: see --parts
 --suite=gpu and --suite=growth are named sets of flags. --compare=sbx measures another implementation as well.
 
 A measurement compiles a loop (a second to a minute) and reports the median of --repeats timed calls of about --seconds
@@ -31,6 +32,7 @@ A measurement that fails prints a line that begins with `failed`; the others con
 written again after each measurement.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -56,6 +58,8 @@ def main(argv: Sequence[str]) -> None:
     check_flags()
     logging.set_verbosity(logging.WARNING)
     environment = compare.peer_environment() if FLAGS.compare else {}
+    if "gpu" in FLAGS.suites:  # its processes share the GPU's memory with this one
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     jax_settings.prepare()
     jax_settings.start_jax(bench_flags.most_devices())
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured

@@ -127,13 +127,14 @@ def test_the_gpu_suite_runs_here(tmp_path):
         "experiments.bench",
         "--suite=gpu",
         "--tasks=cheetah",
-        "--algos=td3",
+        "--parts=loops",
         "--members=1",
+        "--patience=10",
     ]
     command += ["--physics=mujoco", "--seconds=0", "--repeats=1", f"--json={tmp_path / 'bench.json'}"]
     done = subprocess.run(command, cwd=Path(__file__).parent.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "bench.json").read_text())
     (row,) = report["rows"]
-    assert report["failed"] == [] and row["rate"] > 0 and row["kinds"]
-    assert " operations per step, " in done.stdout and "| loop | td3 on cheetah, mujoco | 1 |" in done.stdout
+    assert report["failed"] == [] and row["rate"] > 0
+    assert "| loop | td3_sqt on cheetah, mujoco | 1 |" in done.stdout

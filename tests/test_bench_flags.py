@@ -28,6 +28,7 @@ def _parsed():
         ("devices", "0"),
         ("compare", "cleanrl"),
         ("devices", "most"),
+        ("parts", "all"),
         ("members", "all"),
     ],
 )
@@ -38,7 +39,7 @@ def test_a_wrong_value_is_rejected_in_one_line(flag, value):
     assert message.startswith(f"--{flag}: expects ") and value in message and "\n" not in message
 
 
-@pytest.mark.parametrize("flag", ["tasks", "algos", "members", "devices", "capacities", "physics"])
+@pytest.mark.parametrize("flag", ["tasks", "algos", "members", "devices", "capacities", "physics", "parts"])
 def test_an_empty_list_is_rejected_except_of_suites(flag):
     with flagsaver.flagsaver(suites=[]):
         check_flags()
@@ -87,6 +88,11 @@ def test_physics_that_cannot_run_here_is_left_out_or_rejected(monkeypatch):
     assert bench_flags.physics_here() == ["mjx", "mujoco"]
     with flagsaver.flagsaver(physics=["warp"]), pytest.raises(SystemExit, match="^--physics: warp needs a part$"):
         bench_flags.physics_here()
+    with (
+        flagsaver.flagsaver(physics=["warp", "mjx", "mujoco"]),
+        pytest.raises(SystemExit, match="^--physics: warp needs a part; --physics=mjx,mujoco leaves it out$"),
+    ):
+        bench_flags.physics_here()
 
 
 def test_a_named_suite_sets_the_flags_that_were_not_given():
@@ -94,8 +100,8 @@ def test_a_named_suite_sets_the_flags_that_were_not_given():
         FLAGS["tasks"].present = 1
         try:
             check_flags()
-            assert FLAGS.members == ["5", "64", "512"] and FLAGS.algos == ["td3", "td7"]
-            assert FLAGS.profile and FLAGS.suites == ["loop"] and FLAGS.devices == ["1", "auto"]
+            assert FLAGS.members == ["25", "100", "250"] and FLAGS.physics == ["warp", "mjx", "mujoco"]
+            assert (FLAGS.suites, FLAGS.devices, FLAGS.seconds, FLAGS.repeats) == (["gpu"], ["1"], 2.0, 3)
             assert FLAGS.tasks == list(PAPERS_TASKS)  # as given
         finally:
             FLAGS["tasks"].present = 0

@@ -31,11 +31,10 @@ LAYERS = [
     {"experiments.surroundings.jax_settings"},
     {"experiments.running"},
     {"experiments.evidence"},
-    {"experiments.launchers"},
+    {"experiments.launchers", "experiments.gymnasium_parity"},
     {
         "experiments.playing",
         "experiments.benchmarks",
-        "experiments.gymnasium_parity",
         "experiments.theorem",
         "experiments.grids",
         "experiments.running.session",

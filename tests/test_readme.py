@@ -12,6 +12,7 @@ import pytest
 from absl.testing import flagsaver
 
 from experiments import bench, play, plots, report, run, tables
+from experiments.benchmarks import gpu_bundle
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import UsageError
 from experiments.run import own_environment
@@ -75,6 +76,7 @@ TUNES = [argv for argv in SHELL if argv[0] == "tune"]
 LOOKS = [argv for argv in SHELL if argv[0] in ("tables", "plots", "report", "play")]
 BENCHES = [argv for argv in SHELL if argv[0] == "bench"]
 OTHERS = [argv for argv in SHELL if argv[0] in ("tabular", "parity", "soak", "killtest")]
+BUNDLES = [argv for argv in SHELL if argv[0] == "benchmarks.gpu_bundle"]
 
 
 def name_of(example):
@@ -182,6 +184,11 @@ def test_commands_that_measure_are_valid(argv, monkeypatch):
         bench.check_flags()
 
 
+@pytest.mark.parametrize("argv", BUNDLES, ids=ids)
+def test_commands_that_bring_packages_are_valid(argv):
+    assert vars(gpu_bundle.parser().parse_args(argv[1:]))["command"] == argv[1]
+
+
 def test_a_file_of_settings_is_valid(tmp_path):
     (code,) = (code for kind, _, code in BLOCKS["experiments/README.md"] if kind == "yaml")
     (tmp_path / "settings.yaml").write_text(code)
@@ -224,7 +231,7 @@ def test_flags_of_other_commands_exist(argv, help_of):
 
 
 def test_every_command_shown_is_checked():
-    assert len(RUNS + SWEEPS + TUNES + LOOKS + BENCHES + OTHERS) == len(SHELL)
+    assert len(RUNS + SWEEPS + TUNES + LOOKS + BENCHES + OTHERS + BUNDLES) == len(SHELL)
     assert len(PYTHON) >= 5 and len(RUNS) >= 15 and len(LOOKS) >= 10 and len(BENCHES) >= 5 and len(OTHERS) >= 5
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 from absl import flags
 
-from experiments.benchmarks import compare, gpu_target, growth, measure_kernels
+from experiments.benchmarks import compare, gpu_target, growth, measure_gpu, measure_kernels
 from experiments.benchmarks.suites import MORE_SUITES, SUITES, Request
 from experiments.commandline import arguments
 from experiments.commandline.path_flags import define_path
@@ -23,12 +23,13 @@ from sqt_jax import algorithms, envs
 # --suite: flags by name, which flags on the command line override.
 NAMED_SUITES: dict[str, dict[str, Any]] = {
     "gpu": {
-        "suites": ["loop"],
-        "algos": ["td3", "td7"],
-        "tasks": ["ant", "humanoid"],
-        "members": ["5", "64", "512"],
-        "devices": ["1", "auto"],
-        "profile": True,
+        "suites": ["gpu"],
+        "tasks": ["ant"],
+        "members": ["25", "100", "250"],
+        "physics": list(measure_gpu.PHYSICS),
+        "devices": ["1"],
+        "seconds": 2.0,
+        "repeats": 3,
     },
     "growth": {"suites": ["growth"], "tasks": ["cheetah"], "members": ["5"]},
 }
@@ -38,10 +39,10 @@ flags.DEFINE_enum(
     "suite",
     None,
     list(NAMED_SUITES),
-    "A named set of flags: gpu (loops of td3 and td7 with up to 512 members, profiled) or growth (cost over members, "
-    "critics and capacity). Flags on the command line override it.",
+    "A named set of flags: gpu (all to be known about a GPU in 15 minutes) or growth (cost over members, critics and "
+    "capacity). Flags on the command line override it.",
 )
-flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay and growth use only the first one.")
+flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay, growth and gpu use only the first one.")
 flags.DEFINE_list(
     "physics",
     None,
@@ -57,6 +58,10 @@ flags.DEFINE_list(
 flags.DEFINE_list("capacities", ["10000", "1000000"], "Capacities of the suites replay and memory.")
 flags.DEFINE_boolean("profile", False, "Also count and time the device operations of the suite loop.")
 flags.DEFINE_boolean("peak", True, "Also measure the peak of matrix products, which updates are compared with.")
+flags.DEFINE_list(
+    "parts", list(measure_gpu.PARTS), f"Parts of the suite gpu, made in this order: {', '.join(measure_gpu.PARTS)}."
+)
+flags.DEFINE_float("patience", 1.0, "Factor of the limits of time of these parts, for a slow machine.", lower_bound=0.0)
 define_path("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list(
     "compare", [], f"Other implementations to measure, interleaved with ours: {', '.join(compare.NEEDS)}."
@@ -72,7 +77,7 @@ def check_flags() -> None:
     for name, value in NAMED_SUITES.get(FLAGS.suite, {}).items():
         if not FLAGS[name].present:
             FLAGS[name].value = value
-    for name in ("tasks", "algos", "members", "devices", "capacities", "physics"):
+    for name in ("tasks", "algos", "members", "devices", "capacities", "physics", "parts"):
         if FLAGS[name].value == []:  # only --suites may be empty, next to --compare
             sys.exit(f"--{name}: expects at least one")
     known = {
@@ -81,6 +86,7 @@ def check_flags() -> None:
         "tasks": envs.TASKS,
         "algos": algorithms.ALGORITHMS,
         "physics": envs.PHYSICS,
+        "parts": measure_gpu.PARTS,
     }
     for name, values in known.items():
         for value in getattr(FLAGS, name) or ():
@@ -142,7 +148,9 @@ def physics_here() -> list[str]:
         return []
     for name in FLAGS.physics or ():
         if missing := envs.lacks(name):
-            sys.exit(f"--physics: {name} needs {missing}")
+            others = ",".join(other for other in FLAGS.physics if other != name)
+            without = f"; --physics={others} leaves it out" if others else ""
+            sys.exit(f"--physics: {name} needs {missing}{without}")
     return FLAGS.physics or [name for name in envs.PHYSICS if not envs.lacks(name)]
 
 
@@ -183,6 +191,8 @@ def request() -> Request:
         devices=devices_here(),
         capacities=[int(value) for value in FLAGS.capacities],
         profile=FLAGS.profile,
+        parts=FLAGS.parts,
+        patience=FLAGS.patience,
         compare=FLAGS.compare,
         peer_python=FLAGS.peer_python,
     )

@@ -34,12 +34,7 @@ def profile(run: Callable[[int], Any], steps: int) -> list[Kind]:
     Raises:
       RuntimeError: the profile is incomplete, because it has too many events.
     """
-    options = jax.profiler.ProfileOptions()
-    options.python_tracer_level = 0  # no Python functions
-    with tempfile.TemporaryDirectory() as folder:
-        with jax.profiler.trace(folder, profiler_options=options):
-            jax.block_until_ready(run(steps))
-        events = [event for path in Path(folder).rglob("*.trace.json.gz") for event in _events(path)]
+    events = record(run, steps)
     count: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
     for event in innermost(events):
@@ -48,6 +43,16 @@ def profile(run: Callable[[int], Any], steps: int) -> list[Kind]:
         seconds[name] += event["dur"] / 1e6  # microseconds
     kinds = [Kind(name, number / steps, seconds[name] / steps) for name, number in count.items()]
     return sorted(kinds, key=lambda kind: -kind.seconds)
+
+
+def record(run: Callable[[int], Any], steps: int) -> list[dict[str, Any]]:
+    """The profiler's events of `run(steps)`; raises as `profile`."""
+    options = jax.profiler.ProfileOptions()
+    options.python_tracer_level = 0  # no Python functions
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder, profiler_options=options):
+            jax.block_until_ready(run(steps))
+        return [event for path in Path(folder).rglob("*.trace.json.gz") for event in _events(path)]
 
 
 def _events(path: Path) -> list[dict[str, Any]]:

@@ -20,7 +20,10 @@ MEGABYTES = "MB"
 SECONDS = "s"
 KERNELS = "kernels per step"
 QUESTIONS = "questions to the host per step"
-AMOUNTS = (MEGABYTES, SECONDS, KERNELS, QUESTIONS)  # units of a figure that is not a rate
+GRAPHS = "CUDA graphs per step"
+ERROR = "m/s or rad/s, median error"
+EQUAL = "% of the arrays equal"
+AMOUNTS = (MEGABYTES, SECONDS, KERNELS, QUESTIONS, GRAPHS, ERROR, EQUAL)  # units of a figure that is not a rate
 PROFILED_STEPS = 4  # lockstep steps; the actor learns in half of them
 
 

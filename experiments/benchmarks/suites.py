@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from experiments.benchmarks import compare, growth
+from experiments.benchmarks import compare, growth, measure_gpu
 from experiments.benchmarks.measure_batches import bench_batches
 from experiments.benchmarks.measure_checkpoints import bench_checkpoint
 from experiments.benchmarks.measure_envs import bench_env, bench_physics
@@ -17,7 +17,7 @@ from experiments.benchmarks.measure_updates import bench_updates
 from experiments.benchmarks.measurements import Failure, Measurement, error_line
 
 SUITES = ("env", "physics", "update", "replay", "loop", "checkpoint")  # measured by default
-MORE_SUITES = ("growth", "memory", "batches", "kernels", "starts")
+MORE_SUITES = ("growth", "memory", "batches", "kernels", "starts", "gpu")
 
 
 class Request(NamedTuple):
@@ -33,6 +33,8 @@ class Request(NamedTuple):
     devices: Sequence[int | None]  # None: as a run chooses
     capacities: Sequence[int]
     profile: bool
+    parts: Sequence[str]  # of the suite gpu
+    patience: float
     compare: Sequence[str]
     peer_python: str
 
@@ -45,7 +47,10 @@ def measure_all(request: Request, environment: Mapping[str, str], **timing: Any)
       timing: `seconds` and `repeats` of `timing.measure`.
     """
     for what, measurements in itertools.chain(
-        _suites(request, timing), _growth(request, timing), _comparisons(request, environment, timing)
+        _suites(request, timing),
+        _gpu(request, timing),
+        _growth(request, timing),
+        _comparisons(request, environment, timing),
     ):
         try:
             yield from measurements
@@ -90,6 +95,12 @@ def _suites(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
             for algo, task in itertools.product(algos, tasks):
                 loops = bench_loops(algo, task, members, physics, request.devices, request.profile, **timing)
                 yield f"loop: {algo} on {task}", loops
+
+
+def _gpu(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
+    if "gpu" in request.suites:
+        parts = measure_gpu.parts_of(request.parts, request.tasks[0], request.members, request.physics, **timing)
+        yield "gpu", measure_gpu.bench_gpu(parts, request.patience)
 
 
 def _growth(request: Request, timing: dict[str, Any]) -> Iterator[Part]:

@@ -5,4 +5,5 @@ streams.py       standard output that may be full, closed or ASCII
 consoles.py      rich consoles, as wide as their tables in files and pipes
 paths.py         `~` in flags and variables
 jax_settings.py  JAX's switches, compilation cache and devices
+gpu_options.py   XLA's options for GPUs, all off
 """

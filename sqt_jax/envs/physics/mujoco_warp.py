@@ -8,6 +8,8 @@ Needs the package warp-lang (the extra `warp`). Warp also runs on a CPU, slowly,
 """
 
 import functools
+import os
+import re
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -56,9 +58,7 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
         for name, columns in written.items():
             warp.copy(outputs[:, columns], _rows(getattr(data, name)))
 
-    # On a GPU Warp captures a call as one CUDA graph.
-    graphs = warp.JaxCallableGraphMode.WARP if jax.default_backend() == "gpu" else warp.JaxCallableGraphMode.NONE
-    step_worlds = warp.jax_callable(control_step, graph_mode=graphs)
+    step_worlds = warp.jax_callable(control_step, graph_mode=_graph_mode(jax.default_backend()))
 
     @jax.custom_batching.custom_vmap
     def advance_all(inputs: Array) -> Array:
@@ -89,6 +89,17 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
         )
 
     return Physics(make_mjx(setup).place, advance)
+
+
+def _graph_mode(backend: str) -> warp.JaxCallableGraphMode:
+    """Who captures a call as one CUDA graph on a GPU: Warp, or XLA if it was asked to put loops into graphs.
+
+    A loop in a graph cannot contain a call with a graph of its own.
+    """
+    if backend != "gpu":
+        return warp.JaxCallableGraphMode.NONE
+    in_xlas = re.search(r"xla_gpu_enable_command_buffer=\S*WHILE", os.environ.get("XLA_FLAGS", ""))
+    return warp.JaxCallableGraphMode.JAX if in_xlas else warp.JaxCallableGraphMode.WARP
 
 
 def _columns(model: mujoco.MjModel, names: Sequence[str]) -> dict[str, slice]:

@@ -1,0 +1,52 @@
+"""The measurements of a part's process, at tiny sizes on this machine."""
+
+import json
+
+import pytest
+
+from experiments.benchmarks import gpu_process
+from experiments.benchmarks.gpu_trace import Work
+from experiments.benchmarks.measurements import ERROR, GRAPHS, KERNELS, QUESTIONS, Failure, Measurement, Prepared
+from experiments.benchmarks.part_process import parsed
+from experiments.gymnasium_parity.trajectories import StepErrors
+
+
+def test_a_loop_is_told_from_the_default_by_its_label(monkeypatch):
+    rows = [Measurement("loop", "td3 on ant, warp", 5, "env steps"), Failure("loop: td3 on ant", "why")]
+    monkeypatch.setattr(gpu_process, "bench_loops", lambda *case, **timing: rows)
+    found = gpu_process.loop("td3", "ant", "warp", 5, seconds=0.0, repeats=1, label=", a label")
+    assert [row.what for row in found] == ["td3 on ant, warp, a label", "loop: td3 on ant, a label"]
+
+
+def test_parity_gives_the_median_error_of_velocities(monkeypatch):
+    errors = StepErrors(1e-6, 2e-5, 3e-6, 0.0, 4e-7, 0.0, 1.0)
+    monkeypatch.setattr(gpu_process.envs, "make", lambda task, physics: (task, physics))
+    monkeypatch.setattr(gpu_process, "compare_steps", lambda task, env, count: errors)
+    (row,) = gpu_process.parity("ant", "warp")
+    assert row.figure == ("1e-06", ERROR)
+    assert row.what == (
+        "ant, warp, a control step against MuJoCo "
+        "(95 %: 2.0e-05, observation 3.0e-06, reward 4.0e-07, terminations equal in 100 %)"
+    )
+
+
+def test_a_profile_gives_counts_of_one_step(monkeypatch):
+    monkeypatch.setattr(gpu_process, "loop_steps", lambda *case: Prepared(lambda steps: None))
+    monkeypatch.setattr(gpu_process.kernels, "record", lambda run, steps: [])
+    work = Work(kernels=800, graphs=8, copies_to_host=12, seconds=0.008, longest={"dot": 0.75})
+    monkeypatch.setattr(gpu_process.gpu_trace, "count", lambda events: work)
+    rows = list(gpu_process.profile("td3", "ant", "warp", 25))
+    assert [(row.rate, row.unit) for row in rows] == [(200.0, KERNELS), (2.0, GRAPHS), (3.0, QUESTIONS)]
+    assert rows[0].what == "td3 on ant, warp (busy 2.00 ms a step: dot 75%)"
+
+
+@pytest.mark.slow
+def test_every_kind_runs_here(capsys, monkeypatch):
+    monkeypatch.setattr(gpu_process.simulators, "LACKS", {})
+    case = {"algo": "td3_sqt", "task": "cheetah", "physics": "mujoco", "members": 1}
+    gpu_process.main("loop", json.dumps({**case, "seconds": 0.0, "repeats": 1}))
+    gpu_process.main("parity", json.dumps({"task": "cheetah", "physics": "mujoco"}))
+    gpu_process.main("profile", json.dumps(case))
+    rows = [row for text in capsys.readouterr().out.splitlines() if (row := parsed(text))]
+    assert [row.suite for row in rows] == ["loop", "parity", *["profile"] * 3]
+    assert rows[0].rate > 0 and rows[1].rate < 1e-5 and rows[2].rate > 10
