@@ -8,13 +8,13 @@ interrupted ones resumed, so the same command can be repeated. Runs of the same 
 others. The exit code is the worst of the runs': 130 interrupted, 1 failed, 2 bad usage, 3 a member diverged, 0 done.
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from absl import app, flags
 
-from experiments.commandline.arguments import BAD_USAGE, DONE, UsageError, printable, reject_folder
+from experiments.commandline.answers import refused_in_one_line, say
+from experiments.commandline.arguments import DONE, UsageError, reject_folder
 from experiments.commandline.known_flags import parse_known
 from experiments.commandline.path_flags import define_path
 from experiments.grids import status
@@ -22,7 +22,7 @@ from experiments.grids.grid import GRIDS, OWN_GRID, make_cells, needs_training
 from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import repeat_command, submit_and_leave, train_cells
 from experiments.launchers import launcher_flags, slurm_status
-from experiments.launchers.choice import make_launcher
+from experiments.launchers.choice import check_launcher, make_launcher
 from experiments.launchers.slurm import SlurmLauncher
 
 FLAGS = flags.FLAGS
@@ -30,39 +30,37 @@ FLAGS = flags.FLAGS
 
 def main(argv: Sequence[str]) -> int:
     """Trains the grid; `argv` has the program name and the flags for every run. Returns the exit code."""
-    try:
-        out = Path(FLAGS.out)
-        cells = make_cells(FLAGS.grid, FLAGS.algos, FLAGS.tasks, out, argv[1:], _seeds_per_cell(FLAGS.split))
-        if FLAGS.status:
-            _say(*status.status_lines(cells, slurm_status.job_texts(cells, out)))
-            return DONE
-        if FLAGS.dry_run:
-            _say(*(repeat_command(cell) for cell in cells if needs_training(cell)))
-            return DONE
-        reject_folder("--out", out)
-        launcher = make_launcher(launcher_flags.given(FLAGS, out))
-        if FLAGS.detach and isinstance(launcher, SlurmLauncher):
-            return submit_and_leave(cells, launcher, _say)
-        with collected_signals() as received:
-            return train_cells(
-                cells,
-                launcher,
-                _say,
-                retries=FLAGS.retries,
-                fail_fast=FLAGS.fail_fast,
-                signals=lambda: len(received),
-            )
-    except UsageError as error:
-        print(printable(str(error)), file=sys.stderr)
-        return BAD_USAGE
-    except OSError as error:  # of a cell's log
-        print(printable(f"--out={FLAGS.out}: expects a folder that can be written: {error}"), file=sys.stderr)
-        return BAD_USAGE
+    return refused_in_one_line(lambda: sweep(argv[1:]), FLAGS.out)
 
 
-def _say(*lines: str) -> None:
-    for line in lines:
-        print(printable(line), flush=True)
+def sweep(run_flags: Sequence[str]) -> int:
+    """As `main`. Raises `UsageError`, and `OSError` if --out cannot be written."""
+    out = Path(FLAGS.out)
+    cells = make_cells(FLAGS.grid, FLAGS.algos, FLAGS.tasks, out, run_flags, _seeds_per_cell(FLAGS.split))
+    options = launcher_flags.given(FLAGS, out)
+    check_launcher(options)
+    for name in ("fail_fast", "retries"):
+        if FLAGS.detach and FLAGS[name].present:
+            raise UsageError(f"--{name}: has no effect with --detach; expects a sweep that waits for its runs")
+    if FLAGS.status:
+        say(*status.status_lines(cells, slurm_status.job_texts(cells, out)))
+        return DONE
+    if FLAGS.dry_run:
+        say(*(repeat_command(cell) for cell in cells if needs_training(cell)))
+        return DONE
+    reject_folder("--out", out)
+    launcher = make_launcher(options)
+    if FLAGS.detach and isinstance(launcher, SlurmLauncher):
+        return submit_and_leave(cells, launcher, say)
+    with collected_signals() as received:
+        return train_cells(
+            cells,
+            launcher,
+            say,
+            retries=FLAGS.retries,
+            fail_fast=FLAGS.fail_fast,
+            signals=lambda: len(received),
+        )
 
 
 def _seeds_per_cell(text: str | None) -> int | None:
@@ -83,7 +81,7 @@ if __name__ == "__main__":
     define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/. On a cluster: a folder that all machines share.")
     launcher_flags.define("With local: runs side by side, each on GPUs or cores of its own.")
     flags.DEFINE_bool("detach", None, "With slurm: submit and leave; --status shows the runs.")
-    flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
+    launcher_flags.define_retries()
     flags.DEFINE_bool("fail_fast", False, "Stop at the first run that fails.")
     flags.DEFINE_bool("status", False, "Print the state of the grid's runs and train nothing.")
     flags.DEFINE_bool("dry_run", False, "Print a command per run that is not finished, and train nothing.")

@@ -1,5 +1,6 @@
 """A cell's process: its log, how it ended, signals, and that it dies with its starter."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -9,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from experiments.launchers import cell_process
 from experiments.launchers.cell import Cell, Ended, read_ended
 from experiments.launchers.cell_process import CellProcess
+from experiments.running import folder_lock
 
 ROOT = Path(__file__).resolve().parent.parent
 PYTHON = sys.executable
@@ -72,6 +75,27 @@ def test_the_log_has_all_output_and_the_reason_is_of_the_last_process(start, tmp
     process = start("exit 1")
     assert read_ended(cell) is None  # it runs
     assert process.wait().reason == "it printed nothing"
+
+
+def test_an_end_that_cannot_be_written_is_an_end(start, monkeypatch):
+    def full(ended):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cell_process, "write_ended", full)
+    assert start("exit 0").wait().code == 0
+    process = start("echo why; exit 1")
+    assert process.wait().reason == "why"
+    process.cell.log.unlink()
+    assert process.wait().reason.startswith("its log cannot be read: ")
+
+
+def test_a_run_that_another_process_trains_says_nothing_of_the_cell(start, tmp_path):
+    with folder_lock.locked(tmp_path / "out" / "run"):
+        process = start("echo '--name=run: expects another run'; exit 2")
+        assert process.wait() == Ended(process.cell, 2, "--name=run: expects another run")
+        assert read_ended(process.cell) is None
+    start("exit 2").wait()
+    assert read_ended(process.cell).code == 2  # the lock is free
 
 
 @pytest.mark.parametrize(

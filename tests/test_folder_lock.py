@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 from test_lock_record import DAMAGED
 
+from experiments.launchers import ray_options
 from experiments.running import files, folder_lock, lock_record
 from experiments.running.folder_lock import Busy, Timing, locked
 
+JOB = ray_options.job_name("f00d", 7)  # as two starts of a cell have it
 FOREVER = 100.0  # a test that waited for it would be noticed
 
 HOLD = """
@@ -167,11 +169,11 @@ def test_without_flock_the_record_locks(tmp_path, monkeypatch, number):
 
 
 def test_a_process_that_lives_on_another_host_keeps_others_out(tmp_path, hold, local_flock):
-    process = hold("b", "local", SQT_JOB="ray:7")
+    process = hold("b", "local", SQT_JOB=JOB)
     lines = []
     with pytest.raises(Busy) as busy, locked(tmp_path / "run", lines.append, host="a", timing=Timing(expires=5)):
         pass
-    assert str(busy.value) == f"host b, process {process.pid}, job ray:7"
+    assert str(busy.value) == f"host b, process {process.pid}, job {JOB}"
     assert len(lines) == 1 and f"{busy.value}, which the system's locks may not reach" in lines[0]
 
 
@@ -311,8 +313,8 @@ def test_of_many_that_race_one_goes_on(tmp_path, local_flock):
 
 
 def test_a_later_attempt_awaits_the_lock_of_an_earlier_one(tmp_path, hold, monkeypatch):
-    process = hold("b", SQT_JOB="ray:7")
-    monkeypatch.setenv("SQT_JOB", "ray:7")
+    process = hold("b", SQT_JOB=JOB)
+    monkeypatch.setenv("SQT_JOB", JOB)
     lines = []
 
     def end(line):
@@ -321,14 +323,14 @@ def test_a_later_attempt_awaits_the_lock_of_an_earlier_one(tmp_path, hold, monke
 
     with locked(tmp_path / "run", end, host="a", timing=Timing(0.1, 0.5, FOREVER, FOREVER)):
         assert record(tmp_path / "run").process == os.getpid()
-    assert len(lines) == 1 and f"process {process.pid}, job ray:7, an earlier attempt at this job" in lines[0]
+    assert len(lines) == 1 and f"process {process.pid}, job {JOB}, an earlier attempt at this job" in lines[0]
 
 
 def test_it_awaits_it_for_a_while(tmp_path, hold, monkeypatch):
-    hold(SQT_JOB="ray:7")
-    monkeypatch.setenv("SQT_JOB", "ray:7")
+    hold(SQT_JOB=JOB)
+    monkeypatch.setenv("SQT_JOB", JOB)
     began = time.monotonic()
-    with pytest.raises(Busy, match="job ray:7"), locked(tmp_path / "run", timing=Timing(0.1, 0.5, 0.3, FOREVER)):
+    with pytest.raises(Busy, match=f"job {JOB}"), locked(tmp_path / "run", timing=Timing(0.1, 0.5, 0.3, FOREVER)):
         pass
     assert time.monotonic() - began >= 0.3
 
@@ -351,8 +353,8 @@ def test_a_later_attempt_on_another_host_does_not_watch(tmp_path, hold, monkeypa
 
 
 def test_an_earlier_attempt_that_lives_ends_before_the_later_one_goes_on(tmp_path, hold, monkeypatch, local_flock):
-    process = hold("b", "local", SQT_JOB="ray:7")
-    monkeypatch.setenv("SQT_JOB", "ray:7")
+    process = hold("b", "local", SQT_JOB=JOB)
+    monkeypatch.setenv("SQT_JOB", JOB)
     with locked(tmp_path / "run", pytest.fail, host="a", timing=Timing(1.5, FOREVER, FOREVER, 0.1)):
         assert process.poll() == 130  # it beats every 0.1 s and had 1.6
         assert record(tmp_path / "run").host == "a"
@@ -363,14 +365,26 @@ def test_an_earlier_attempt_that_lives_ends_before_the_later_one_goes_on(tmp_pat
 
 def test_the_holder_of_a_folder_is_read_without_its_lock(tmp_path, hold, monkeypatch):
     assert folder_lock.holder(tmp_path / "run") is None
-    process = hold("b", SQT_JOB="ray:7")
+    process = hold("b", SQT_JOB=JOB)
     monkeypatch.setattr(fcntl, "flock", pytest.fail)
-    assert folder_lock.holder(tmp_path / "run") == ("b", process.pid, "ray:7", True)
+    assert folder_lock.holder(tmp_path / "run") == ("b", process.pid, JOB, True)
     kill(process)
     now = time.time()
     for seconds, alive in ((0, True), (70, True), (80, False), (-50, True), (-70, None)):
         os.utime(tmp_path / "run" / "lock", (now - seconds, now - seconds))
         assert folder_lock.holder(tmp_path / "run").alive is alive
+
+
+def test_a_holder_of_this_host_that_was_killed_is_not_alive(tmp_path, hold):
+    process = hold()
+    assert folder_lock.holder(tmp_path / "run").alive is True
+    process.kill()  # nobody has waited for it yet: its number is still taken
+    give_up = time.monotonic() + 30
+    while folder_lock.holder(tmp_path / "run").alive and time.monotonic() < give_up:
+        time.sleep(0.01)
+    assert folder_lock.holder(tmp_path / "run").alive is False
+    process.wait()
+    assert folder_lock.holder(tmp_path / "run").alive is False
 
 
 def test_nobody_holds_a_released_or_empty_lock(tmp_path):

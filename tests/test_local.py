@@ -1,11 +1,14 @@
 """The local launcher: shares of cores and GPUs, side by side, cancelling."""
 
+import json
 import os
 import signal
 
+import psutil
 import pytest
+from started_sweeps import Run, rows, start_sweep, wait_for
 
-from experiments.commandline.arguments import INTERRUPTED, UsageError
+from experiments.commandline.arguments import FAILED, INTERRUPTED, UsageError
 from experiments.launchers.cell import Cell, Ended
 from experiments.launchers.local import LocalLauncher, Share, shares, visible_gpus
 
@@ -95,6 +98,22 @@ def test_cells_run_side_by_side_each_on_a_free_share():
     assert not any(process.signals for process in Process.started)
 
 
+def test_a_cell_that_cannot_be_started_fails_and_the_others_go_on():
+    def start(cell, cores, variables):
+        if cell == CELLS[0]:
+            raise IsADirectoryError(21, "Is a directory", "a.log.txt")
+        return Process(cell, cores, variables)
+
+    with LocalLauncher([Share((0,))], start) as launcher:
+        launcher.submit(CELLS[:2])
+        failed = Ended(CELLS[0], FAILED, "cannot be started: [Errno 21] Is a directory: 'a.log.txt'")
+        (process,) = Process.started
+        process.code = 0
+        assert launcher.ended() == [failed] and launcher.ended() == [Ended(CELLS[1], 0, "")]
+        launcher.submit(CELLS[:1])
+        assert launcher.ended() == [failed]
+
+
 def test_cancel_asks_the_running_ones_and_drops_the_waiting_ones():
     with LocalLauncher([Share()], Process) as launcher:
         launcher.submit(CELLS[:3])
@@ -114,3 +133,25 @@ def test_an_error_leaves_no_process():
         raise KeyError
     (process,) = Process.started
     assert process.signals == [signal.SIGKILL] and process.code == -9
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()) < 2, reason="one core")
+def test_two_workers_one_of_whose_runs_is_killed_have_the_rows_of_one_after_another(tmp_path):
+    grid = ["--algos=td3,td3_sqt"]
+    plain = start_sweep(tmp_path / "plain", *grid, core=sorted(os.sched_getaffinity(0))[0])
+    plain.communicate()
+    sweep = start_sweep(tmp_path / "out", *grid, "--workers=2")
+    parent = psutil.Process(sweep.pid)
+
+    def runs():
+        return [Run(parent, child) for child in parent.children() if "experiments.run" in child.cmdline()]
+
+    run = wait_for(lambda: next((run for run in runs() if run.is_half_done()), None))
+    assert len({tuple(run.process.cpu_affinity()) for run in runs()}) == 2
+    run.process.kill()
+    text, errors = sweep.communicate(timeout=240)
+    assert (plain.returncode, sweep.returncode, errors) == (0, 0, ""), text + errors
+    assert ": killed by SIGKILL; started again (1 of 2)\n" in text
+    assert json.loads((run.path / "config.json").read_text())["resumed"]
+    assert rows(tmp_path / "out") == rows(tmp_path / "plain") and len(rows(tmp_path / "out")) == 4

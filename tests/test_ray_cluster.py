@@ -10,7 +10,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-from ray_nodes import ray_nodes, rows, runs_on, start_sweep, wait_for
+from ray_nodes import ray_nodes, runs_on
+from started_sweeps import rows, start_sweep, wait_for
 
 from experiments.commandline.arguments import BAD_USAGE, DONE, FAILED, INTERRUPTED, UsageError
 from experiments.launchers import ray_cluster
@@ -81,7 +82,20 @@ def test_the_driver_knows_the_cells_and_what_they_need(launch, tmp_path, monkeyp
     assert settings["address"] == "10.0.0.7:6379" and settings["options"]["num_cpus"] == 2
     assert settings["variables"]["JAX_PLATFORMS"] == "cpu" and Path(settings["folder"]) == Path.cwd()
     assert settings["expected"][0] == str(tmp_path / "out")
-    assert message == {"submit": [[0, "0", "td3", "out/0", ["--steps=5"]]]}
+    assert message == {"submit": [[0, "0", "td3", "out/0", ["--steps=5"], ""]]}
+
+
+def test_a_cell_that_is_started_again_keeps_its_number_in_the_sweep(launch, tmp_path):
+    script = SERVE % f"open({str(tmp_path / 'seen')!r}, 'a').write(settings['sweep'] + line)\n    {END_ALL}"
+    for _ in range(2):
+        with launch(script) as launcher:
+            for cells in (CELLS[:2], CELLS[1:]):
+                launcher.submit(cells)
+                all_ended(launcher, 2)
+    lines = (tmp_path / "seen").read_text().splitlines()
+    assert len({line.partition("{")[0] for line in lines}) == 2  # sweeps
+    numbers = [[fields[0] for fields in json.loads(line[line.index("{") :])["submit"]] for line in lines]
+    assert numbers == [[0, 1], [1, 2]] * 2
 
 
 def test_cancelling_reaches_the_driver(launch):

@@ -13,9 +13,9 @@ from experiments.commandline.arguments import FAILED, INTERRUPTED, UsageError  #
 from experiments.launchers import ray_driver  # noqa: E402
 from experiments.launchers.cell import Cell, Ended, read_ended  # noqa: E402
 from experiments.launchers.ray_driver import Settings, Tasks, check_nodes  # noqa: E402
-from experiments.launchers.ray_options import RayOptions  # noqa: E402
+from experiments.launchers.ray_options import RayOptions, job_name  # noqa: E402
 
-SETTINGS = Settings(None, {}, [], {}, os.getcwd())
+SETTINGS = Settings(None, {}, [], {"JAX_PLATFORMS": "cpu"}, os.getcwd(), "f00d")
 SMALL = {"NodeID": "a", "Alive": True, "Resources": {"CPU": 2.0}, "NodeManagerHostname": "small"}
 GONE = SMALL | {"Alive": False, "Resources": {"CPU": 8.0, "GPU": 1.0}}
 
@@ -24,13 +24,14 @@ class FakeRay:
     """Ray's functions, and a task of its own whose n-th call is "task n"."""
 
     def __init__(self):
-        self.results, self.nodes, self.cancelled, self.given = {}, [SMALL], [], []
+        self.results, self.nodes, self.cancelled, self.given, self.variables = {}, [SMALL], [], [], []
 
     def options(self, **options):
         self.given.append(options)
         return self
 
-    def remote(self, *_):
+    def remote(self, cell, expected, variables, *_):
+        self.variables.append(variables)
         return f"task {len(self.given)}"
 
     def get(self, task):
@@ -70,7 +71,7 @@ def served(*messages):
 
 
 def submitted(cell):
-    return {"submit": [[5, cell.task, cell.algo, str(cell.path), cell.command]]}
+    return {"submit": [[5, cell.task, cell.algo, str(cell.path), cell.command, cell.detail]]}
 
 
 def test_results_are_told(fake, cell):
@@ -78,6 +79,7 @@ def test_results_are_told(fake, cell):
     assert served(submitted(cell)) == [{"ended": [5, 3, "diverged", False]}]
     (options,) = fake.given
     assert options["max_retries"] == 0 and options["num_cpus"] == 1 and options["name"] == "td3 on ant"
+    assert fake.variables == [{"JAX_PLATFORMS": "cpu", "SQT_JOB": job_name("f00d", 5)}]
 
 
 def test_a_lost_task_is_told_and_noted_for_the_status(fake, cell):

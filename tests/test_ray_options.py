@@ -3,7 +3,8 @@
 import pytest
 
 from experiments.commandline.arguments import UsageError
-from experiments.launchers.ray_options import RayOptions, parse
+from experiments.launchers.ray_options import RayOptions, job_name, parse
+from experiments.running.lock_record import new_record
 
 
 def test_the_defaults_are_one_core_and_a_gpu_where_there_are_some():
@@ -58,3 +59,11 @@ def test_errors_are_one_line(text, line):
     with pytest.raises(UsageError) as error:
         parse(text)
     assert str(error.value).startswith(line) and "\n" not in str(error.value)
+
+
+def test_starts_of_a_cell_are_attempts_at_one_job():
+    def record(sweep, number):
+        return new_record(variables={"SQT_JOB": job_name(sweep, number)})
+
+    assert record("f00d", 7).succeeds(record("f00d", 7))
+    assert not record("f00d", 7).succeeds(record("f00d", 8)) and not record("f00d", 7).succeeds(record("beef", 7))

@@ -146,6 +146,20 @@ def test_an_error_at_the_start_is_raised_and_later_costs_one_cell(fake, cells):
     assert launcher.ended() == [Ended(cells[2], 1, "Socket timed out", lost=True)]
 
 
+def test_a_full_disk_ends_a_launcher_that_begins_and_costs_a_later_one_a_cell(fake, cells, monkeypatch):
+    def full(cells):
+        raise OSError(28, "No space left on device")
+
+    launcher = fake.launcher()
+    launcher.submit(cells[:2])
+    fake.array = full
+    with pytest.raises(OSError, match="No space"):
+        fake.launcher().submit(cells[2:])
+    monkeypatch.setattr(launcher, "_array", full)
+    launcher.submit(cells[2:])
+    assert launcher.ended() == [Ended(cells[2], 1, "[Errno 28] No space left on device", lost=True)]
+
+
 def test_jobs_of_an_earlier_command_are_awaited(fake, cells):
     fake.launcher().submit(cells)  # left, or killed
     fake.queue["1_2"] = "CANCELLED"
@@ -215,11 +229,17 @@ def test_a_user_who_cancels_a_job_means_it(cells, tmp_path, job, ended, lost):
     assert found == ended._replace(cell=cells[0], lost=lost)
 
 
-def test_a_job_that_refuses_is_not_started_again(cells, tmp_path):
+@pytest.mark.parametrize(
+    "line",
+    [
+        "--launcher=slurm: expects the folder /x on all machines; n1 does not have it",
+        "--resume=runs/ant/td3/x: host n1, process 5 is training runs/ant/td3/x; expects another run",
+    ],
+)
+def test_a_job_that_refuses_is_not_started_again(cells, tmp_path, line):
     log = tmp_path / "log"
-    log.write_text("Traceback\n--launcher=slurm: expects the folder /x on all machines; n1 does not have it\nsrun: x\n")
-    ended = outcome(cells[0], FAILED, Submitted("1_0", log), tmp_path, waited=False)
-    assert (ended.code, ended.lost) == (2, False) and ended.reason.endswith("n1 does not have it")
+    log.write_text(f"Traceback\n{line}\nsrun: x\n")
+    assert outcome(cells[0], FAILED, Submitted("1_0", log), tmp_path, waited=False) == Ended(cells[0], 2, line)
 
 
 def test_a_machine_that_does_not_see_the_folder_is_named(cells, tmp_path):

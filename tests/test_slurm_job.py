@@ -11,6 +11,7 @@ import pytest
 from experiments.launchers import slurm_job
 from experiments.launchers.cell import Cell, read_ended
 from experiments.launchers.slurm_job import MAX_IDLE_REQUEUES, CellJob, ThisJob, this_job
+from experiments.running import folder_lock
 
 SAVED = "interrupted; the same command resumes it"
 SAVES = "trap 'exit 130' USR1\nwhile :; do sleep 0.02; done"
@@ -95,6 +96,14 @@ def test_a_run_that_ends_by_itself_gives_the_job_its_exit_code(job, code):
     assert job.ended == (code, "why" if code == 1 else "", False)
     assert job.calls == ["update JobId=4_1 JobName=td3-ant"]
     assert (job.folder / "began").read_text() == "slurm 4_1\n"
+
+
+def test_a_run_that_is_refused_says_so_in_the_jobs_log(job, capsys):
+    with folder_lock.locked(
+        job.cell.path
+    ):  # another process trains it: the cell's file does not say how this one ended
+        assert job.run("echo '--name=run: expects another run'\nexit 2") == 2
+    assert capsys.readouterr().err == "--name=run: expects another run\n" and job.ended is None
 
 
 @pytest.mark.parametrize("number", slurm_job.SAVE)

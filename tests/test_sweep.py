@@ -1,6 +1,7 @@
 """The sweep command."""
 
 import glob
+import json
 import shlex
 import signal
 import subprocess
@@ -27,6 +28,8 @@ from made_runs import write_run
             "--grid=table2 --name=x",
             "--name=x: expects flags of experiments.run in the form --flag=value, except --algo",
         ),
+        ("--grid=table2 --max_jobs=2 --dry_run", "--max_jobs: has no effect with --launcher=local; expects slurm"),
+        ("--grid=table2 --launcher=slurm --detach --retries=2", "--retries: has no effect with --detach; expects "),
         ("--grid=table2 --tasks=ant --stepz=4", "--stepz: unknown flag; did you mean --steps?"),
     ],
 )
@@ -41,18 +44,19 @@ COMMAND = ["sweep", "--algos=td3,td3_sqt", "--tasks=ant"]
 
 
 def test_dry_run_prints_a_command_per_run_that_is_not_finished(tmp_path, commands):
-    write_run(tmp_path, "td3", "ant", name="steps=10")
-    (tmp_path / "ant" / "td3" / "steps=10" / "summary.json").write_text('{"status": "done"}')
-    done = commands.run(*COMMAND, "--steps=10", f"--out={tmp_path}", "--dry_run")
+    write_run(tmp_path, "td3", "ant", name="lr=0.1")
+    summary = {"status": "done", "diverged": [], "groups": []}
+    (tmp_path / "ant" / "td3" / "lr=0.1" / "summary.json").write_text(json.dumps(summary))
+    done = commands.run(*COMMAND, "--lr=0.1", f"--out={tmp_path}", "--dry_run")
     assert done.returncode == 0, done.stderr
     assert shlex.split(done.stdout) == [
         *("python", "-m", "experiments.run", "--algo=td3_sqt", "--env=ant"),
-        *(f"--out={tmp_path}", "--name=steps=10", "--resume", "--steps=10"),
+        *(f"--out={tmp_path}", "--name=lr=0.1", "--resume", "--lr=0.1"),
     ]
 
 
 def test_status_of_a_grid_that_has_not_begun(tmp_path, commands):
-    done = commands.run(*COMMAND, "--steps=10", f"--out={tmp_path / 'new'}", "--status")
+    done = commands.run(*COMMAND, "--lr=0.1", f"--out={tmp_path / 'new'}", "--status")
     assert done.returncode == 0, done.stderr
     assert done.stdout == "td3 on ant      waiting\ntd3_sqt on ant  waiting\n2 runs: 2 waiting\n"
     assert not any(tmp_path.iterdir())

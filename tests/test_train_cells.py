@@ -7,7 +7,8 @@ import pytest
 
 from experiments import run
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED
-from experiments.grids.grid import Grid, cells_of, finished
+from experiments.grids.finished import finished
+from experiments.grids.grid import Grid, cells_of
 from experiments.grids.train_cells import repeat_command, submit_and_leave, train_cells
 from experiments.launchers.cell import Ended
 from experiments.running import loop, session
@@ -178,6 +179,7 @@ def test_signals_cancel_once_each_and_a_lost_cell_is_then_interrupted(tmp_path):
     launcher = OneByOne(one)
     code = train_cells(cells, launcher, lines.append, retries=2, signals=lambda: len(signals))
     assert code == INTERRUPTED and launcher.cancels == 2
+    assert lines[1].startswith("1/4 td3 on ant: interrupted; the same command resumes it; ")
     assert [line.split("; ")[0] for line in lines[2:5]] == [
         "2/4 td3_sqt on ant: not started",
         "3/4 td3 on walker: not started",

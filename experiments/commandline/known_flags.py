@@ -17,6 +17,7 @@ def parse_known(argv: Sequence[str]) -> list[str]:
         line = str(error).removeprefix("flag ").splitlines()[0]
         found = re.match(r"-*(\w+)=", line)
         if found and found[1] in flags.FLAGS:
-            line = f"--{found[1]}: expects {flags.FLAGS[found[1]].parser.syntactic_help}"
+            # absl says nothing of switches
+            line = f"--{found[1]}: expects {flags.FLAGS[found[1]].parser.syntactic_help or 'true or false'}"
         print(printable(line), file=sys.stderr)
         sys.exit(BAD_USAGE)

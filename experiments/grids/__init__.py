@@ -1,1 +1,1 @@
-"""Grids of runs: the cells of the paper's tables, and training them one after another."""
+"""Grids of runs: the cells of the paper's tables and of grids of one's own, and training them through a launcher."""

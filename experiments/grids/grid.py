@@ -1,29 +1,28 @@
 """The grids, their cells, and the names of the runs."""
 
 import hashlib
-import json
 import os
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from experiments.commandline import flags
 from experiments.commandline.arguments import UsageError
 from experiments.evidence.published import PAPERS_TASKS
+from experiments.grids.check_cells import check_cells, check_once, own_environment
+from experiments.grids.finished import finished
+from experiments.grids.own_grid import CELL_FLAGS, OWN_GRID, check_not_set, parse_variants
 from experiments.launchers.cell import Cell
 from experiments.running import run_config
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS
-from sqt_jax.envs import env_args
-from sqt_jax.envs.factories import is_factory, make_from
+from sqt_jax.envs.factories import is_factory
 from sqt_jax.suggestions import expects_one_of
 
 PAPERS_BASELINES = ("td3", "sac", "td7")
 MAX_NAME = 200
 MAX_CELLS = 10_000
-# Flags of experiments.run that the grid sets, differently for each cell.
-CELL_FLAGS = ("algo", "env", "out", "name", "resume", "overwrite")
 
 
 class Grid(NamedTuple):
@@ -42,7 +41,6 @@ GRIDS = {
     "all": Grid(tuple(f"{baseline}{suffix}" for baseline in PAPERS_BASELINES for suffix in ("", "_sqt", "_sqt_tuple"))),
     "alpha": Grid(("td3_sqt",), ("cheetah",), (("--penalty_coef=0,0.1,0.25,0.5,1",),)),
 }
-OWN_GRID = "settings like 'penalty_coef=0.1,0.5;ensemble_size=2,5' with --algos and --tasks"
 
 
 def make_cells(
@@ -62,20 +60,23 @@ def make_cells(
       seeds_per_cell: splits the seeds of each run over cells of at most so many; None: one cell has all.
 
     Raises:
-      UsageError: a name is unknown, or a flag is invalid or one of `CELL_FLAGS`.
+      UsageError: a name is unknown; a flag is invalid, of no effect with an algorithm, set twice or one of
+        `CELL_FLAGS`; or a run comes twice.
     """
     grid = _find_grid(name, algos, tasks)
     for algo in algos:
         if algo not in ALGORITHMS:
             raise UsageError(f"--algos: {expects_one_of(algo, ALGORITHMS)}")
     try:
-        tasks = [task if is_factory(task) else envs.resolve(task) for task in tasks]
+        resolved = [task if is_factory(task) else envs.resolve(task) for task in tasks]
     except ValueError as error:
         raise UsageError(f"--tasks: {error}") from None
+    check_once("--algos", algos, algos)
+    check_once("--tasks", tasks, resolved)
     check_run_flags(run_flags, CELL_FLAGS)
-    cells = cells_of(grid, algos, tasks, out, run_flags, seeds_per_cell)
-    for cell in cells:  # before any of them starts
-        flags.parse(["run", *cell.command])
+    check_not_set(grid.variants, run_flags, name or "")
+    cells = cells_of(grid, algos, resolved, out, run_flags, seeds_per_cell)
+    check_cells(cells)
     return cells
 
 
@@ -99,28 +100,6 @@ def _find_grid(name: str | None, algos: Sequence[str], tasks: Sequence[str]) -> 
     return Grid(tuple(algos), tuple(tasks), parse_variants(name or ""))
 
 
-def parse_variants(text: str) -> tuple[tuple[str, ...], ...]:
-    """The variants of a grid like `penalty_coef=0.1,0.5;hidden=64,64|256,256`: all combinations of the values.
-
-    Values are separated by commas; by `|` if there is one, for values with commas. Raises `UsageError`.
-    """
-    choices = []
-    for part in filter(None, (part.strip() for part in text.split(";"))):
-        setting, equals, values = part.partition("=")
-        found = [value.strip() for value in values.split("|" if "|" in values else ",")]
-        if not equals or not setting.isidentifier() or not all(found):
-            raise UsageError(f"--grid={text}: expects {OWN_GRID}, not {part!r}")
-        if setting in (*CELL_FLAGS, "config"):
-            raise UsageError(f"--grid={text}: expects settings of a run, not {setting}")
-        if len(set(found)) < len(found):
-            raise UsageError(f"--grid={text}: expects each value of {setting} once")
-        choices.append([f"--{setting}={value}" for value in found])
-    names = [group[0].partition("=")[0] for group in choices]
-    if len(set(names)) < len(names):
-        raise UsageError(f"--grid={text}: expects each setting once")
-    return tuple(product(*choices))
-
-
 def cells_of(
     grid: Grid,
     algos: Sequence[str],
@@ -130,13 +109,15 @@ def cells_of(
     seeds_per_cell: int | None = None,
 ) -> list[Cell]:
     """The cells of a grid, task by task; arguments as in `make_cells`. Raises `UsageError` if there are too many."""
+    parts = [part for variant in grid.variants for part in split_seeds((*variant, *run_flags), seeds_per_cell)]
+    common = set(parts[0]).intersection(*parts)
     cells = []
-    for task, variant, algo in product(tasks or grid.tasks, grid.variants, algos or grid.algos):
-        for own_flags in split_seeds((*variant, *run_flags), seeds_per_cell):
-            name = run_name(own_flags)
-            command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name}", "--resume", *own_flags)
-            path = out / _task_folder(task, own_flags) / algo / name
-            cells.append(Cell(task=task, algo=algo, path=path, command=command))
+    for task, own_flags, algo in product(tasks or grid.tasks, parts, algos or grid.algos):
+        name = run_name(own_flags)
+        command = (f"--algo={algo}", f"--env={task}", f"--out={out}", f"--name={name}", "--resume", *own_flags)
+        path = out / _task_folder(task, own_flags) / algo / name
+        detail = " ".join(word.lstrip("-") for word in own_flags if word not in common)
+        cells.append(Cell(task=task, algo=algo, path=path, command=command, detail=detail))
     if len(cells) > MAX_CELLS:
         raise UsageError(f"--grid: expects at most {MAX_CELLS:,} runs, not {len(cells):,}")
     return cells
@@ -148,13 +129,8 @@ def _task_folder(task: str, run_flags: Sequence[str]) -> str:
         return run_config.task_folder(task)
     parsed = flags.parse(["run", "--algo=td3", f"--env={task}", *run_flags])
     assert parsed
-    try:
-        arguments = env_args.parse(parsed.settings.get("env_args", ""))
-        env = make_from(task, arguments, parsed.settings.get("max_episode_steps", 0), 0)
-    except ValueError as error:
-        raise UsageError(f"--tasks: {task}: {error}") from None
-    if env.host:
-        env.host.close()
+    env = own_environment(task, parsed)
+    assert env
     return run_config.task_folder(env.name)
 
 
@@ -180,15 +156,6 @@ def run_name(run_flags: Sequence[str]) -> str:
         return name
     digest = hashlib.sha256(os.fsencode("\n".join(sorted(run_flags))))
     return f"{name[: MAX_NAME - 13]}_{digest.hexdigest()[:12]}"
-
-
-def finished(cell: Cell) -> dict[str, Any] | None:
-    """The content of summary.json if the cell's run has ended, else None."""
-    try:
-        summary = json.loads((cell.path / "summary.json").read_text())
-        return summary if summary["status"] in ("done", "diverged") else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def needs_training(cell: Cell) -> bool:

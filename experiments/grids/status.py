@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from experiments.commandline.arguments import DIVERGED, DONE
-from experiments.grids.grid import finished
+from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED
+from experiments.grids.finished import finished, scores
 from experiments.launchers.cell import Cell, read_ended
 from experiments.running import folder_lock, records, run_config
 from experiments.running.progress import format_seconds
@@ -65,7 +65,7 @@ def state_of(cell: Cell, job: tuple[str, str] | None = None) -> State:
         return State("interrupted" if begun else "waiting", _progress(cell) if begun else "")
     if ended.code in (DONE, DIVERGED):
         return State("waiting", "")  # its folder was removed since
-    if ended.lost or ended.reason.startswith("interrupted"):
+    if ended.lost or ended.code == INTERRUPTED:
         return State("interrupted", f"{_progress(cell)} ({ended.reason})")
     return State("failed", f"{ended.reason}; log: {cell.log}")
 
@@ -86,16 +86,6 @@ def progress_text(cell: Cell) -> str | None:
     """A line about a run that is being trained; None if it is not."""
     state = state_of(cell)
     return f"{cell.label}: {state.text}" if state.word == "running" else None
-
-
-def scores(summary: dict[str, Any] | None) -> str:
-    """The scores in a run's summary.json, as text."""
-    if summary is None:
-        return "no summary"
-    found = [group["score"] for group in summary["groups"]]
-    parts = ["none" if s["mean"] is None else f"{s['mean']:,.0f} +- {s['std']:,.0f}" for s in found]
-    lost = len(summary["diverged"])
-    return f"score {', '.join(parts)}" + (f" ({lost} diverged)" if lost else "")
 
 
 def _is_newer(path: Path, other: Path) -> bool:

@@ -5,9 +5,10 @@ import time
 from collections.abc import Callable, Sequence
 
 from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED
-from experiments.grids.grid import finished, needs_training
-from experiments.grids.status import progress_text, scores
-from experiments.launchers.cell import Cell, Ended
+from experiments.grids.finished import finished, scores
+from experiments.grids.grid import needs_training
+from experiments.grids.status import progress_text
+from experiments.launchers.cell import INTERRUPTED_TEXT, Cell, Ended
 from experiments.launchers.launcher import Launcher
 from experiments.launchers.slurm import SlurmLauncher
 from experiments.running.progress import format_seconds
@@ -57,7 +58,7 @@ def train_cells(
             for ended in launcher.ended():
                 cell = ended.cell
                 if ended.lost and (cancelled or signals()):  # it was asked to end before it could save
-                    ended = ended._replace(code=INTERRUPTED)
+                    ended = ended._replace(code=INTERRUPTED, reason=INTERRUPTED_TEXT)
                 elif ended.lost and starts[cell] <= retries:
                     say(f"{cell.label}: {ended.reason}; started again ({starts[cell]} of {retries})")
                     starts[cell] += 1

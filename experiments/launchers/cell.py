@@ -12,6 +12,7 @@ from experiments.running import files
 
 MAX_STEM = 100  # bytes of a run's name in the names of these files
 MAX_BYTES = 100_000
+INTERRUPTED_TEXT = "interrupted; the same command resumes it"  # the reason of a run that has saved and ended
 
 
 class Cell(NamedTuple):
@@ -21,11 +22,12 @@ class Cell(NamedTuple):
     algo: str
     path: Path  # the run's folder
     command: tuple[str, ...]  # arguments of experiments.run; they have --resume
+    detail: str = ""  # what tells it from the grid's other cells of this algorithm and task
 
     @property
     def label(self) -> str:
         """For messages."""
-        return f"{self.algo} on {self.task}"
+        return f"{self.algo} on {self.task}" + (f", {self.detail}" if self.detail else "")
 
     @property
     def log(self) -> Path:

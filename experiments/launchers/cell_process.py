@@ -5,14 +5,16 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
-from experiments.commandline.arguments import DIVERGED, DONE, FAILED, INTERRUPTED, printable
+from experiments.commandline.arguments import BAD_USAGE, DIVERGED, DONE, FAILED, INTERRUPTED, printable
 from experiments.launchers import tied
-from experiments.launchers.cell import Cell, Ended, write_ended
+from experiments.launchers.cell import INTERRUPTED_TEXT, Cell, Ended, write_ended
+from experiments.running import folder_lock
 
 TAIL_BYTES = 10_000
 MAX_REASON = 500
-WORDS = {INTERRUPTED: "interrupted; the same command resumes it", DONE: "", DIVERGED: ""}
+WORDS = {INTERRUPTED: INTERRUPTED_TEXT, DONE: "", DIVERGED: ""}
 
 
 class CellProcess:
@@ -54,8 +56,15 @@ class CellProcess:
         except subprocess.TimeoutExpired:
             return None
         ended = self._explained(code)
-        write_ended(ended)
+        if not self._is_of_another(ended):
+            with suppress(OSError):  # a full disk: only --status misses it
+                write_ended(ended)
         return ended
+
+    def _is_of_another(self, ended: Ended) -> bool:
+        """Whether the run was refused while another process trains it: the file would be about that one's run."""
+        holder = folder_lock.holder(self.cell.path) if ended.code == BAD_USAGE else None
+        return bool(holder and holder.alive)
 
     def _explained(self, code: int) -> Ended:
         if code < 0:
@@ -65,10 +74,13 @@ class CellProcess:
 
     def _last_line(self) -> str:
         """The last line that this process printed: of a run that failed, its error."""
-        with self.cell.log.open("rb") as log:
-            log.seek(0, os.SEEK_END)
-            log.seek(max(self._began, log.tell() - TAIL_BYTES))
-            lines = log.read().decode(errors="replace").strip().splitlines()
+        try:
+            with self.cell.log.open("rb") as log:
+                log.seek(0, os.SEEK_END)
+                log.seek(max(self._began, log.tell() - TAIL_BYTES))
+                lines = log.read().decode(errors="replace").strip().splitlines()
+        except OSError as error:
+            return f"its log cannot be read: {printable(str(error))}"[:MAX_REASON]
         return printable(lines[-1].strip())[:MAX_REASON] if lines else "it printed nothing"
 
 

@@ -25,6 +25,11 @@ def define(workers: str) -> None:
     flags.DEFINE_string("ray", None, "With ray: resources of a run, as num_cpus=2,num_gpus=1,resources.NAME=1.")
 
 
+def define_retries() -> None:
+    """Defines --retries."""
+    flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
+
+
 def given(values: flags.FlagValues, out: Path) -> LauncherOptions:
     """The flags of launchers that were given."""
     options: dict[str, Any] = {name: values[name].value for name in LauncherOptions._fields if name in values}

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from experiments.commandline.arguments import INTERRUPTED, UsageError
+from experiments.commandline.arguments import FAILED, INTERRUPTED, UsageError
 from experiments.launchers.cell import Cell, Ended
 from experiments.launchers.cell_process import CellProcess
 
@@ -40,7 +40,7 @@ class LocalLauncher:
         self._start = start
         self._waiting: deque[Cell] = deque()
         self._running: dict[Cell, tuple[Any, Share]] = {}
-        self._dropped: list[Ended] = []
+        self._over: list[Ended] = []  # without a process
         self._cancelled = False
 
     def submit(self, cells: Sequence[Cell]) -> None:
@@ -50,7 +50,7 @@ class LocalLauncher:
 
     def ended(self) -> list[Ended]:
         """As `Launcher.ended`."""
-        found, self._dropped = self._dropped, []
+        found, self._over = self._over, []
         give_up = time.monotonic() + 1.0
         while not found and self._running and time.monotonic() < give_up:
             time.sleep(POLL_SECONDS)
@@ -64,7 +64,7 @@ class LocalLauncher:
 
     def cancel(self) -> None:
         """As `Launcher.cancel`."""
-        self._dropped += [Ended(cell, INTERRUPTED, "not started") for cell in self._waiting]
+        self._over += [Ended(cell, INTERRUPTED, "not started") for cell in self._waiting]
         self._waiting.clear()
         for process, _ in self._running.values():
             process.send_signal(signal.SIGKILL if self._cancelled else signal.SIGTERM)
@@ -72,8 +72,12 @@ class LocalLauncher:
 
     def _fill(self) -> None:
         while self._free and self._waiting:
-            cell, share = self._waiting.popleft(), self._free.pop(0)
-            self._running[cell] = (self._start(cell, share.cores, share.variables), share)
+            cell, share = self._waiting.popleft(), self._free[0]
+            try:
+                self._running[cell] = (self._start(cell, share.cores, share.variables), share)
+                del self._free[0]
+            except OSError as error:
+                self._over.append(Ended(cell, FAILED, f"cannot be started: {error}"))
 
     def __enter__(self) -> "LocalLauncher":
         return self

@@ -47,7 +47,12 @@ def folder_complaint(expected: Expected, seconds: float = 1.0) -> str | None:
         time.sleep(seconds if look else 0)
         if Path(expected.token).exists():
             return None
-    return f"--out={expected.out}: expects a folder that all machines share; {platform.node()} does not see it"
+    return not_shared(expected.out, platform.node())
+
+
+def not_shared(out: str, host: str) -> str:
+    """The line that refuses the folder `out`, which `host` does not see."""
+    return f"--out={out}: expects a folder that all machines share; {host} does not see it"
 
 
 def complaint(expected: Expected, launcher: str, seconds: float = 1.0) -> str | None:

@@ -7,7 +7,6 @@ import secrets
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ class RayLauncher:
 
     def __init__(self, options: RayOptions, out: Path, address: str | None, program: Sequence[str] = DRIVER):
         self._options, self._out, self._address, self._program = options, out, address, program
-        self._numbers = count()
+        self._numbers: dict[Cell, int] = {}  # a cell that is started again keeps its number
         self._running: dict[int, Cell] = {}
         self._driver: MessageProcess | None = None
         self._held = ExitStack()
@@ -47,9 +46,10 @@ class RayLauncher:
         if not cells:
             return
         self._driver = self._driver or self._start()
-        numbered = dict(zip(self._numbers, cells))  # noqa: B905  numbers have no end
+        numbered = {self._numbers.setdefault(cell, len(self._numbers)): cell for cell in cells}
         self._running |= numbered
-        self._driver.send(submit=[[number, c.task, c.algo, str(c.path), c.command] for number, c in numbered.items()])
+        fields = [[number, c.task, c.algo, str(c.path), c.command, c.detail] for number, c in numbered.items()]
+        self._driver.send(submit=fields)
 
     def ended(self) -> list[Ended]:
         """As `Launcher.ended`."""
@@ -73,6 +73,7 @@ class RayLauncher:
             expected=expected,
             variables=forwarded_variables(os.environ),
             folder=os.getcwd(),
+            sweep=secrets.token_hex(4),
         )
         if self._address:
             _wait_for("connected", driver, CONNECT_SECONDS, f"RAY_ADDRESS={self._address}: expects {BELONGING}")

@@ -2,8 +2,8 @@
 
 It is a process of its own because Ray ends the driver's process where the cluster is lost and writes to its streams,
 and because a terminal's signals must not reach the cluster that it starts. Input and output are a JSON object per line:
-first `Settings`, then `{"submit": [[number, task, algo, path, command], ...]}` and `{"cancel": true}`; answered by
-`{"connected": true}`, `{"ready": true}`, `{"ended": [number, code, reason, lost]}`, and before it ends by itself
+first `Settings`, then `{"submit": [[number, task, algo, path, command, detail], ...]}` and `{"cancel": true}`; answered
+by `{"connected": true}`, `{"ready": true}`, `{"ended": [number, code, reason, lost]}`, and before it ends by itself
 `{"refused": text}` or `{"lost": text}`. It ends with its input.
 """
 
@@ -25,7 +25,7 @@ from experiments.commandline.arguments import FAILED, UsageError
 from experiments.launchers import ray_errors
 from experiments.launchers.cell import Cell, write_ended
 from experiments.launchers.local import visible_gpus
-from experiments.launchers.ray_options import RayOptions
+from experiments.launchers.ray_options import RayOptions, job_name
 from sqt_jax.job_limits import usable_cores
 
 WAIT_SECONDS = 0.5
@@ -43,6 +43,7 @@ class Settings(NamedTuple):
     expected: list[Any]  # of `Expected`
     variables: dict[str, str]  # of each cell's environment
     folder: str  # the working directory of each cell, where a machine has it
+    sweep: str  # differs from all others
 
 
 def main() -> None:
@@ -167,9 +168,10 @@ class Tasks:
                 self._cancel()
 
     def _submit(self, cells: Sequence[Sequence[Any]]) -> None:
-        for number, task_name, algo, path, command in cells:
-            cell = Cell(task_name, algo, Path(path), tuple(command))
-            arguments = (tuple(cell), self._settings.expected, self._settings.variables)
+        for number, task_name, algo, path, command, detail in cells:
+            cell = Cell(task_name, algo, Path(path), tuple(command), detail)
+            variables = self._settings.variables | {"SQT_JOB": job_name(self._settings.sweep, number)}
+            arguments = (tuple(cell), self._settings.expected, variables)
             # Not packed on few nodes. The retries are the sweep's.
             options = {"name": cell.label, "max_retries": 0, "scheduling_strategy": "SPREAD"}
             task = self._train.options(**options, **self._options.task_options)

@@ -53,6 +53,14 @@ class RayOptions(NamedTuple):
         return ",".join(f"{k}={v:g}" if isinstance(v, float) else f"{k}={v}" for k, v in given.items() if v)
 
 
+def job_name(sweep: str, number: int) -> str:
+    """The name of a cell's job: one for all its starts by a sweep, so that the run's lock knows them as attempts.
+
+    Not Ray's ids: that of a task is new at each start, and those of jobs begin again with each cluster.
+    """
+    return f"ray {sweep} {number}"
+
+
 def parse(text: str) -> RayOptions:
     """The options in the value of `--ray`. Raises `UsageError`."""
     found: dict[str, Any] = {}

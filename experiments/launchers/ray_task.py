@@ -30,7 +30,7 @@ def train(
     Args:
       cell_fields, expected: fields of `Cell` and `node_check.Expected`. Ray could not load the classes themselves
         before `ray_driver` has told the worker where the modules are.
-      variables: of the process's environment.
+      variables: of the process's environment. SQT_JOB is the same at each start of the cell (`ray_options.job_name`).
       num_cpus: how many cores it may use.
       gpus: how many GPUs Ray has given to this task; below 1: a part of one.
     """
@@ -43,8 +43,7 @@ def train(
     before = signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
     try:
         context = ray.get_runtime_context()
-        own = {"SQT_JOB": f"ray {context.get_job_id()} {context.get_task_id()}"}
-        own |= gpu_variables(gpus, os.environ | variables)
+        own = gpu_variables(gpus, os.environ | variables)
         with node_cores.reserved_cores(num_cpus, _node_cpus(context.get_node_id())) as cores:
             return _wait(CellProcess(cell, cores, {**variables, **own}), asked)
     finally:

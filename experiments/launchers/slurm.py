@@ -9,6 +9,7 @@ from pathlib import Path
 from experiments.commandline.arguments import BAD_USAGE, FAILED, INTERRUPTED, UsageError, printable
 from experiments.launchers import slurm_options, slurm_queue, slurm_records
 from experiments.launchers.cell import Cell, Ended, read_ended
+from experiments.launchers.node_check import not_shared
 from experiments.launchers.slurm_queue import CommandError, Job
 from experiments.launchers.slurm_records import Submitted
 from experiments.launchers.slurm_submission import Submission, submit_array
@@ -17,7 +18,7 @@ POLL_SECONDS = 5.0  # between two questions to SLURM, one for all jobs
 SHARING_SECONDS = 15.0  # a shared folder may show a new file that much later
 STOP_SIGNAL = "USR1"  # a job that gets it saves and ends
 TAIL_BYTES = 2_000
-REFUSALS = ("--out=", "--launcher=")  # how lines begin in which a job refuses to train
+REFUSALS = ("--out=", "--launcher=", "--name=", "--resume=")  # how lines begin in which a job or its run refuses
 
 
 class SlurmLauncher:
@@ -48,8 +49,10 @@ class SlurmLauncher:
         """As `Launcher.submit`. After the first call, cells that cannot be submitted are lost; the others go on."""
         try:
             self._submit(cells)
-        except (UsageError, CommandError) as error:
+        except (UsageError, CommandError, OSError) as error:
             if not self._submitted:
+                if isinstance(error, OSError):
+                    raise
                 raise UsageError(f"{'' if isinstance(error, UsageError) else '--launcher=slurm: '}{error}") from None
             self._refused += [Ended(cell, FAILED, str(error), lost=True) for cell in cells if cell not in self._jobs]
         self._submitted = True
@@ -157,8 +160,7 @@ def outcome(cell: Cell, job: Job | None, submitted: Submitted, out: Path, waited
         return None
     if lines is None:
         node = job.node if job and job.node != "n/a" else "the job's machine"
-        text = f"--out={out}: expects a folder that all machines share; {node} does not see it"
-        return Ended(cell, BAD_USAGE, f"{text} (job {submitted.job}: {state})")
+        return Ended(cell, BAD_USAGE, f"{not_shared(str(out), node)} (job {submitted.job}: {state})")
     last = lines[-1] if lines else "it printed nothing"
     return Ended(cell, FAILED, f"job {submitted.job} was lost ({state}): {last}", lost=True)
 

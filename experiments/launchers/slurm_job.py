@@ -22,8 +22,8 @@ from types import FrameType
 from typing import NamedTuple
 
 from experiments.commandline.arguments import BAD_USAGE, FAILED, INTERRUPTED
-from experiments.launchers import slurm_queue
-from experiments.launchers.cell import Cell, Ended, write_ended
+from experiments.launchers import node_check, slurm_queue
+from experiments.launchers.cell import INTERRUPTED_TEXT, Cell, Ended, write_ended
 from experiments.launchers.cell_process import CellProcess
 
 STOP = (signal.SIGUSR1, signal.SIGINT)
@@ -32,7 +32,6 @@ POLL_SECONDS = 0.5
 REQUEUE_SECONDS = 120.0  # SLURM's controller is asked so long if it does not answer
 MAX_IDLE_REQUEUES = 10  # without a new checkpoint: the job would never end
 NEXT_TRY_SECONDS = 5.0
-INTERRUPTED_TEXT = "interrupted; the same command resumes it"
 
 
 class CellJob(NamedTuple):
@@ -52,8 +51,7 @@ class CellJob(NamedTuple):
         for handled in (*STOP, *SAVE, signal.SIGCONT):  # before it kills a job, SLURM sends SIGCONT too
             signal.signal(handled, handle)
         if not self.token.exists():
-            line = f"--out={self.out}: expects a folder that all machines share; {platform.node()} does not see it"
-            print(line, file=sys.stderr, flush=True)
+            print(node_check.not_shared(self.out, platform.node()), file=sys.stderr, flush=True)
             sys.exit(BAD_USAGE)
         job = this_job(os.environ)
         try:
@@ -74,6 +72,8 @@ class CellJob(NamedTuple):
                 if number == signal.SIGTERM and not job.still_runs():
                     # SLURM may kill the run before it has saved. That it was asked to is known then.
                     write_ended(Ended(self.cell, INTERRUPTED, INTERRUPTED_TEXT, lost=True))
+        if ended.code == BAD_USAGE:
+            print(ended.reason, file=sys.stderr)  # the sweep reads it here if the run belongs to another process
         sys.exit(self._after(ended, set(received), job))
 
     def _after(self, ended: Ended, received: set[int], job: "ThisJob") -> int:

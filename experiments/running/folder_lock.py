@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+import psutil
+
 from experiments.running import files, lock_record
 from experiments.running.lock_record import Record
 from experiments.running.lock_renewal import end_process, renewed
@@ -102,8 +104,9 @@ def locked(
 def holder(folder: Path) -> Holder | None:
     """Who holds `folder`; None if nobody does. Only reads: to try the lock would keep out a run that starts meanwhile.
 
-    `alive` compares the file's time with this host's clock, and lets them differ by a minute: it stays true for the
-    first 75 seconds after a kill. It is None if the file's time is more than a minute ahead.
+    `alive` is exact for a holder of this host. For another host's, it compares the file's time with this host's clock,
+    and lets them differ by a minute: it stays true for the first 75 seconds after a kill. It is None if the file's time
+    is more than a minute ahead.
     """
     try:
         content, written = lock_record.read(folder / "lock")
@@ -118,7 +121,19 @@ def holder(folder: Path) -> Holder | None:
         return UNKNOWN
     age = time.time() - written
     alive = None if age < -CLOCK_TOLERANCE else age <= 3 * BEAT + CLOCK_TOLERANCE
+    if alive and record.boot and record.on_host_of(lock_record.new_record()):
+        alive = _exists(record.process)
     return Holder(record.host, record.process, record.job, alive)
+
+
+def _exists(process: int) -> bool:
+    """Whether a process of this host has not ended."""
+    try:
+        return psutil.Process(process).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+    except psutil.Error:  # another user's
+        return True
 
 
 def _acquire(descriptor: int, path: Path, own: Record, timing: Timing, warn: Callable[[str], None]) -> None:

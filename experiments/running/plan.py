@@ -9,15 +9,14 @@ import jax
 
 from experiments.commandline import flag_table, flags
 from experiments.commandline.arguments import UsageError
-from experiments.commandline.presets import preset_settings
 from experiments.running import memory, records, resume, run_config
+from experiments.running.configurations import check_env, configs_of
 from experiments.running.run_config import Member, RunConfig
 from experiments.surroundings import jax_settings
 from sqt_jax import envs
-from sqt_jax.config import ENVIRONMENT, Config, TrainConfig
+from sqt_jax.config import Config, TrainConfig
 from sqt_jax.envs import gym_ids
-from sqt_jax.envs.factories import is_factory
-from sqt_jax.experiment import OWN_PHYSICS, check_physics, make_config, named_env
+from sqt_jax.experiment import check_physics, named_env
 from sqt_jax.members import Layout, usable_devices
 from sqt_jax.settings import ConfigError, settings_of
 from sqt_jax.types import Environment
@@ -70,7 +69,7 @@ def make_plan(options: flags.Options, env: Environment | None = None) -> Plan:
     Raises:
       UsageError: invalid settings, an existing run of the same name, nothing to resume, or too little memory.
     """
-    _check_env(options, env)
+    check_env(options, env)
     folder_given = options.resume not in (None, flags.LATEST)
     target = _from_folder(options, env) if folder_given else _from_settings(options, env)
     if target.resumed is None and options.name is not None:  # without one, the run gets a folder of its own
@@ -119,49 +118,19 @@ def _one_device(given: int | None) -> int:
     return 1
 
 
-def _check_env(options: flags.Options, env: Environment | None) -> None:
-    """Rejects flags that contradict an environment handed in, or that need one."""
-    by_factory = is_factory(options.env or "")
-    for flag in ("physics", "eval_physics") if by_factory else ENVIRONMENT[1:]:
-        if env is not None and flag in options.settings:
-            raise UsageError(f"--{flag}: has no effect with an environment handed in")
-    for flag in ("physics", "eval_physics"):
-        if options.settings.get(flag) == OWN_PHYSICS:
-            raise UsageError(f"--{flag}={OWN_PHYSICS}: expects an environment handed in: run.main(argv, env=...)")
-    if env is None:
-        return
-    if not isinstance(env, Environment):
-        raise UsageError(f"env: expects an Environment (sqt_jax.make_environment), not a {type(env).__name__}")
-    if options.env not in (None, env.name) and not by_factory:
-        raise UsageError(
-            f"--env={options.env}: expects {env.name!r}, the name of the environment handed in, or no --env"
-        )
-    if not isinstance(env.name, str) or not env.name.isprintable() or not run_config.task_folder(env.name).strip("."):
-        raise UsageError(f"env: expects an environment with a name that can name a folder, not {env.name!r}")
-
-
 def _from_settings(options: flags.Options, env: Environment | None) -> _Target:
     """A new run with these settings, or with --resume an existing one."""
-    named_env = env or options.env
-    assert options.algo and named_env and options.seeds is not None
-    preset: dict[str, Any] = {}
-    try:
-        default = make_config(options.algo, named_env)
-        preset = preset_settings(options.preset, default.algo, default.env)
-        settings = preset | options.settings
-        configs = [
-            make_config(options.algo, named_env, **settings | dict(zip(options.sweep, values, strict=True)))
-            for values in options.configurations
-        ]
-        in_processes = env.host and env.host.processes if env else options.env_processes
-        jax_settings.start_jax(1 if in_processes else options.devices or len(configs) * len(options.seeds))
-        if env is None:
+    assert options.seeds is not None
+    configs = configs_of(options, env)
+    in_processes = env.host and env.host.processes if env else options.env_processes
+    jax_settings.start_jax(1 if in_processes else options.devices or len(configs) * len(options.seeds))
+    if env is None:
+        try:
             check_physics(configs[0])
-    except ConfigError as error:
-        by_preset = error.setting in preset.keys() - options.settings.keys() - options.sweep.keys()
-        raise UsageError(f"{error} (set by --preset={options.preset})" if by_preset else str(error)) from None
+        except ConfigError as error:
+            raise UsageError(str(error)) from None
     members, swept = run_config.make_members(options.seeds, configs), list(options.sweep)
-    folder = Path(options.out) / run_config.task_folder(default.env) / default.algo
+    folder = Path(options.out) / run_config.task_folder(configs[0].env) / configs[0].algo
     path = folder / (options.name or _default_name(options))
     if options.resume is None:
         return _Target(members=members, swept=swept, path=path, resumed=None)
