@@ -34,15 +34,15 @@ def of_update(agent: Agent, state: State, batch: Transition, policy_delay: int) 
 
 
 def _of_products(jaxpr: Any, share: float) -> float:
-    """Operations of a jaxpr; a `cond` counts its costliest branch times `share`."""
+    """Operations of a jaxpr; a branch (`conditional.apply_if`) counts `share` of its own."""
     total = 0.0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             lengths = [equation.invars[0].aval.shape[axis] for axis in contracted]
             total += 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(lengths)
-        elif equation.primitive.name == "cond":
-            total += share * max(_of_products(branch.jaxpr, share) for branch in equation.params["branches"])
+        elif equation.primitive.name == "while" and not equation.params["cond_jaxpr"].jaxpr.eqns:
+            total += share * _of_products(equation.params["body_jaxpr"].jaxpr, share)  # its condition is a given bool
         else:
             inner = sum(_of_products(sub, share) for sub in _inner_jaxprs(equation.params))
             if inner and equation.primitive.name in ("while", "scan"):
