@@ -1,8 +1,8 @@
 """How long a run takes to start: `python -m experiments.bench --suites=starts --tasks=humanoid --physics=mjx`.
 
-A whole run of one step of warm-up and one of training, as a process: Python's imports, the compilation of evaluation,
-warm-up and training, two evaluations of one episode, and the policy. First with an empty compilation cache (cold), then
-with the cache that this left (warm).
+A whole run of one step of warm-up and one of training (batches of two rows), as a process: Python's imports, the
+compilation of evaluation, warm-up and training, two evaluations of one episode, and the policy. First with an empty
+compilation cache (cold), then with the cache that this left (warm).
 """
 
 import os
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from experiments.benchmarks.measurements import SECONDS, Measurement
 
-FLAGS = ("--steps=2", "--warmup_steps=1", "--eval_every=2", "--eval_episodes=1", "--replay_capacity=1000")
+FLAGS = ("--steps=2", "--warmup_steps=1", "--batch_size=2", "--eval_every=2", "--eval_episodes=1")
 NO_FILES = ("--checkpoint_every=0", "--notensorboard", "--quiet")
 
 
