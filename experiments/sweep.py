@@ -81,7 +81,6 @@ if __name__ == "__main__":
     define_path("out", "runs", "Results go to OUT/TASK/ALGO/NAME/. On a cluster: a folder that all machines share.")
     launcher_flags.define("With local: runs side by side, each on GPUs or cores of its own.")
     flags.DEFINE_bool("detach", None, "With slurm: submit and leave; --status shows the runs.")
-    launcher_flags.define_retries()
     flags.DEFINE_bool("fail_fast", False, "Stop at the first run that fails.")
     flags.DEFINE_bool("status", False, "Print the state of the grid's runs and train nothing.")
     flags.DEFINE_bool("dry_run", False, "Print a command per run that is not finished, and train nothing.")

@@ -16,32 +16,28 @@ from collections.abc import Sequence
 
 from absl import app, flags
 
-from experiments.commandline.arguments import BAD_USAGE, FAILED, UsageError, printable, reject_folder
+from experiments.commandline.answers import refused_in_one_line
+from experiments.commandline.arguments import FAILED, reject_folder
 from experiments.commandline.known_flags import parse_known
 from experiments.commandline.path_flags import define_path
 from experiments.launchers import launcher_flags
-from experiments.tuning.rounds import Rounds, make_rounds
-from experiments.tuning.tune_flags import OBJECTIVES, SAMPLERS, Given, Options, check_flags
+from experiments.tuning.rounds import make_rounds
+from experiments.tuning.tune_flags import OBJECTIVES, SAMPLERS, Given, check_flags
 
 FLAGS = flags.FLAGS
 
 
 def main(argv: Sequence[str]) -> int:
     """Tunes; `argv` has the program name and the flags for every run. Returns the exit code."""
-    try:
-        options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), argv[1:])
-        reject_folder("--out", options.out)
-        return tune(options, make_rounds(launcher_flags.given(FLAGS, options.out)))
-    except UsageError as error:
-        print(printable(str(error)), file=sys.stderr)
-        return BAD_USAGE
-    except OSError as error:  # --out was checked: a full disk, for example
-        print(printable(f"--out={FLAGS.out}: expects a folder that can be written: {error}"), file=sys.stderr)
-        return FAILED
+    # FAILED: the folder was checked, so an OSError is a full disk, for example.
+    return refused_in_one_line(lambda: tune(argv[1:]), FLAGS.out, os_error=FAILED)
 
 
-def tune(options: Options, rounds: Rounds) -> int:
-    """Tunes; returns the exit code."""
+def tune(run_flags: Sequence[str]) -> int:
+    """As `main`. Raises `UsageError`, and `OSError` if --out cannot be written."""
+    options = check_flags(Given._make(FLAGS[name].value for name in Given._fields), run_flags)
+    reject_folder("--out", options.out)
+    rounds = make_rounds(launcher_flags.given(FLAGS, options.out))
     from experiments.tuning.session import Session  # imports Optuna and matplotlib
 
     command = shlex.join(["python", "-m", "experiments.tune", *sys.argv[1:]])
@@ -69,5 +65,4 @@ if __name__ == "__main__":
     flags.DEFINE_integer("final_seeds", 10, "How many fresh seeds the winner is trained on.", 1)
     define_path("out", "runs/tuned", "The folder of the study. On a cluster: one that all machines share.")
     launcher_flags.define("Batches that are asked for and trained side by side.")
-    flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
     app.run(main, flags_parser=parse_known)

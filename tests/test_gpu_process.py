@@ -6,7 +6,7 @@ import pytest
 
 from experiments.benchmarks import gpu_process
 from experiments.benchmarks.gpu_trace import Work
-from experiments.benchmarks.measurements import ERROR, GRAPHS, KERNELS, QUESTIONS, Failure, Measurement, Prepared
+from experiments.benchmarks.measurements import ERROR, GRAPHS, HOST_SYNCS, KERNELS, Failure, Measurement, Prepared
 from experiments.benchmarks.part_process import parsed
 from experiments.gymnasium_parity.trajectories import StepErrors
 
@@ -36,7 +36,7 @@ def test_a_profile_gives_counts_of_one_step(monkeypatch):
     work = Work(kernels=800, graphs=8, copies_to_host=12, seconds=0.008, longest={"dot": 0.75})
     monkeypatch.setattr(gpu_process.gpu_trace, "count", lambda events: work)
     rows = list(gpu_process.profile("td3", "ant", "warp", 25))
-    assert [(row.rate, row.unit) for row in rows] == [(200.0, KERNELS), (2.0, GRAPHS), (3.0, QUESTIONS)]
+    assert [(row.rate, row.unit) for row in rows] == [(200.0, KERNELS), (2.0, GRAPHS), (3.0, HOST_SYNCS)]
     assert rows[0].what == "td3 on ant, warp (busy 2.00 ms a step: dot 75%)"
 
 

@@ -1,4 +1,4 @@
-"""The loops and branches of a lockstep step, in the program that is lowered for a GPU: at each the host is asked."""
+"""The loops and branches of a lockstep step in the program that is lowered for a GPU. At each it waits for the host."""
 
 import re
 

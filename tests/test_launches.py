@@ -72,8 +72,8 @@ def test_a_steps_kernels_by_part():
     assert count(TEXT, PARTS, {"restart": 0.1}).total == pytest.approx(12.45)
 
 
-def test_the_host_is_asked_at_unknown_loops_and_conditionals_that_are_reached():
-    found = count(TEXT, PARTS, {"restart": 0.1}).questions
+def test_the_host_is_waited_for_at_unknown_loops_and_conditionals_that_are_reached():
+    found = count(TEXT, PARTS, {"restart": 0.1}).host_syncs
     assert found == pytest.approx({"the loop of steps": 1, "update every 4": 1, "restart": 1.1, "feedback": 1})
 
 

@@ -6,25 +6,21 @@ import sys
 import pytest
 
 from experiments.benchmarks import gpu_target, measure_kernels
-from experiments.benchmarks.measurements import KERNELS, QUESTIONS
+from experiments.benchmarks.measurements import HOST_SYNCS, KERNELS
 
 
-def test_a_case_gives_the_kernels_and_the_questions_with_their_parts():
+def test_a_case_gives_the_kernels_and_the_syncs_with_their_parts():
     commands = []
 
-    def run(command):
+    def run(command, environment):
         commands.append(command)
-        return json.dumps({"kernels": {"act": 2, "update": 40.5, "restart": 0.01}, "questions": {"restart": 1}})
+        assert environment["JAX_PLATFORMS"] == "cuda,cpu"
+        return json.dumps({"kernels": {"act": 2, "update": 40.5, "restart": 0.01}, "host_syncs": {"restart": 1}})
 
-    kernels, questions = measure_kernels.bench_kernels("td3", "ant", 25, "warp", run)
+    kernels, syncs = measure_kernels.bench_kernels("td3", "ant", 25, "warp", run)
     assert commands == [[sys.executable, "-m", "experiments.benchmarks.measure_kernels", "td3", "ant", "warp", "25"]]
     assert kernels.what == "td3 on ant, warp (update: 40.5, act: 2)" and kernels.rate == pytest.approx(42.51)
-    assert kernels.figure == ("42.5", KERNELS) and questions.figure == ("1", QUESTIONS)
-
-
-def test_a_process_that_fails_is_told_by_its_last_line():
-    with pytest.raises(RuntimeError, match="^the reason$"):
-        measure_kernels.run_process([sys.executable, "-c", "import sys; sys.exit('first\\nthe reason')"])
+    assert kernels.figure == ("42.5", KERNELS) and syncs.figure == ("1", HOST_SYNCS)
 
 
 @pytest.mark.slow

@@ -2,8 +2,6 @@
 
 import sys
 
-import pytest
-
 from experiments.benchmarks import measure_starts
 from experiments.benchmarks.measurements import SECONDS
 
@@ -20,8 +18,3 @@ def test_the_second_start_has_the_cache_that_the_first_left():
     assert first[:3] == [sys.executable, "-m", "experiments.run"] and "--seeds=0,1" in first
     assert [a for a, b in zip(first, second, strict=True) if a != b] == [next(a for a in first if "--out=" in a)]
     assert first_variables["JAX_COMPILATION_CACHE_DIR"] == second_variables["JAX_COMPILATION_CACHE_DIR"]
-
-
-def test_a_run_that_fails_gives_its_last_line():
-    with pytest.raises(RuntimeError, match="^--env: no$"):
-        measure_starts.run_process([sys.executable, "-c", "import sys; sys.exit('a\\n--env: no')"], {})

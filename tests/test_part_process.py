@@ -10,7 +10,7 @@ import pytest
 from experiments.benchmarks import part_process
 from experiments.benchmarks.kernels import Kind
 from experiments.benchmarks.measurements import Failure, Measurement
-from experiments.benchmarks.part_process import line, parsed, reason, results
+from experiments.benchmarks.part_process import line, output_of, parsed, reason, results
 
 FOUND = Measurement("loop", "a", 5, "env steps", 12.5, 3.0, kinds=(Kind("dot", 2.0, 0.5),))
 
@@ -23,6 +23,13 @@ def run(program, limit=60.0):
 def test_a_result_is_the_same_after_its_way_as_a_line(found):
     assert parsed(line(found)) == found
     assert parsed("Module mujoco_warp load on device") is None
+
+
+def test_the_last_line_of_a_process_or_why_it_failed():
+    assert output_of([sys.executable, "-c", "print('first'); print('last')"]) == "last"
+    assert output_of([sys.executable, "-c", "import os; print(os.environ['A'])"], {"A": "b"}) == "b"
+    with pytest.raises(RuntimeError, match="^the reason$"):
+        output_of([sys.executable, "-c", "import sys; sys.exit('first\\nthe reason')"])
 
 
 def test_results_arrive_before_the_process_ends():

@@ -179,6 +179,7 @@ def test_commands_that_read_runs_are_valid(argv):
 @pytest.mark.parametrize("argv", BENCHES, ids=ids)
 def test_commands_that_measure_are_valid(argv, monkeypatch):
     monkeypatch.setattr(bench.compare, "lacks", lambda peer, interpreter: False)
+    monkeypatch.setattr(bench.bench_flags.gpu_target, "lacks_plugin", lambda: False)
     with flagsaver.flagsaver():
         assert bench.FLAGS(argv) == argv[:1]  # nothing is left over
         bench.check_flags()

@@ -1,13 +1,12 @@
 """Whether training repeats bit for bit, and resumes bit for bit from a checkpoint, in processes of their own.
 
 `compare` starts `python -m experiments.benchmarks.exact_resume ALGO TASK PHYSICS MEMBERS STEPS FOLDER HOW` three times:
-two complete trainings, and one that continues the first one's checkpoint. Each compiles anew, because XLA may choose
-other kernels each time, and prints a sum of every array at the end.
+two complete trainings, and one that continues the first one's checkpoint. Each compiles for itself, because XLA may
+choose other kernels each time, and prints a sum of every array at the end.
 """
 
 import hashlib
 import json
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -19,11 +18,11 @@ import numpy as np
 
 from experiments.benchmarks.measure_loops import WARMUP_STEPS, loop_config
 from experiments.benchmarks.measurements import EQUAL, Measurement, member_keys
+from experiments.benchmarks.part_process import output_of
 from experiments.running.checkpoints import CheckpointStore
 from experiments.running.loop import Position
 from experiments.surroundings import jax_settings
 from sqt_jax import experiment, train
-from sqt_jax.envs import physics as simulators
 from sqt_jax.members import Layout
 from sqt_jax.trees import by_path
 
@@ -64,14 +63,6 @@ def _sum(leaf: jax.Array) -> str:
     return hashlib.sha256(np.asarray(jax.random.key_data(leaf) if is_key else leaf).tobytes()).hexdigest()
 
 
-def run_process(command: Sequence[str]) -> dict:
-    """The sums that a process prints. Raises `RuntimeError` with the last line of its errors if it fails."""
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or ["it wrote no error"])[-1])
-    return json.loads(done.stdout.strip().splitlines()[-1])
-
-
 def compare(
     algo: str,
     task: str,
@@ -79,19 +70,19 @@ def compare(
     members: int,
     label: str = "",
     steps: int = STEPS,
-    run: Callable[[Sequence[str]], dict] = run_process,
+    run: Callable[[Sequence[str]], str] = output_of,
 ) -> Iterator[Measurement]:
     """The shares of arrays that are bit for bit equal: of two trainings, and of one and its resumed other.
 
     Args:
       label: how the processes differ from the default, in words.
-      run: as `run_process`.
+      run: as `part_process.output_of`; the sums as JSON.
     """
     command = [sys.executable, "-m", __name__, algo, task, physics, str(members), str(steps)]
     with tempfile.TemporaryDirectory() as folder:
-        first = run([*command, f"{folder}/1", WHOLE])
+        first = json.loads(run([*command, f"{folder}/1", WHOLE]))
         for what, other in (("the same again", [f"{folder}/2", WHOLE]), ("resumed", [f"{folder}/1", RESUMED])):
-            second = run([*command, *other])
+            second = json.loads(run([*command, *other]))
             equal = [path for path in first if first[path] == second[path]]
             differing = [path for path in first if first[path] != second[path]]
             verdict = f"differs in {', '.join(differing[:3])}" if differing else "bit for bit equal"
@@ -108,6 +99,5 @@ if __name__ == "__main__":
     jax_settings.prepare()
     jax_settings.start_jax(1)
     jax.config.update("jax_enable_compilation_cache", False)
-    simulators.LACKS.clear()  # the command that started this has asked
     _, algo, task, physics, members, steps, folder, how = sys.argv
     print(json.dumps(train_and_sum(algo, task, physics, int(members), int(steps), Path(folder), how)))

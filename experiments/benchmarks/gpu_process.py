@@ -15,16 +15,15 @@ from experiments.benchmarks.measure_loops import bench_loops, loop_steps
 from experiments.benchmarks.measurements import (
     ERROR,
     GRAPHS,
+    HOST_SYNCS,
     KERNELS,
     PROFILED_STEPS,
-    QUESTIONS,
     Failure,
     Measurement,
 )
 from experiments.gymnasium_parity.trajectories import compare_steps
 from experiments.surroundings import jax_settings
 from sqt_jax import envs
-from sqt_jax.envs import physics as simulators
 
 STATES = 64  # of a comparison with MuJoCo
 
@@ -50,14 +49,14 @@ def parity(task: str, physics: str) -> Iterator[Measurement]:
 
 
 def profile(algo: str, task: str, physics: str, members: int, label: str = "") -> Iterator[Measurement]:
-    """Kernels, CUDA graphs and questions to the host of a step, by the profiler."""
+    """Kernels, CUDA graphs and copies to the host of a step, by the profiler."""
     prepared = loop_steps(algo, task, members, physics)
     jax.block_until_ready(prepared.run(PROFILED_STEPS))
     work = gpu_trace.count(kernels.record(prepared.run, PROFILED_STEPS))
     shares = ", ".join(f"{name} {share:.0%}" for name, share in work.longest.items())
     name = f"{algo} on {task}, {physics}{label}"
     busy = f"busy {1e3 * work.seconds / PROFILED_STEPS:.2f} ms a step: {shares}"
-    counts = {KERNELS: work.kernels, GRAPHS: work.graphs, QUESTIONS: work.copies_to_host}
+    counts = {KERNELS: work.kernels, GRAPHS: work.graphs, HOST_SYNCS: work.copies_to_host}
     for (unit, number), what in zip(counts.items(), (f"{name} ({busy})", name, name), strict=True):
         yield Measurement(suite="profile", what=what, members=members, unit=unit, rate=number / PROFILED_STEPS)
 
@@ -76,7 +75,6 @@ def main(kind: str, arguments: str) -> None:
         jax_settings.prepare()
         jax_settings.start_jax(1)
         jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
-        simulators.LACKS.clear()  # the command that started this has asked
     for found in KINDS[kind](**json.loads(arguments)):
         print(part_process.line(found), flush=True)
 

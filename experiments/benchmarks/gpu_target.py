@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from typing import Any
 
+from experiments.surroundings.gpu_options import with_flags
+
 PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 FLAGS = "--xla_gpu_enable_triton_gemm=false --xla_gpu_autotune_level=0"
 
@@ -36,9 +38,7 @@ def lacks_plugin() -> bool:
 
 def environment(inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Environment variables of a process that calls `compiled_text`: JAX reads them when it starts."""
-    flags = " ".join(filter(None, [inherited.get("XLA_FLAGS", ""), FLAGS]))
-    wanted = {"JAX_PLATFORMS": "cuda,cpu", "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1", "XLA_FLAGS": flags}
-    return {**inherited, **wanted}
+    return with_flags(inherited, FLAGS) | {"JAX_PLATFORMS": "cuda,cpu", "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1"}
 
 
 def compiled_text(function: Callable, *arguments: Any, donate: int) -> str:

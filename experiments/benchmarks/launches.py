@@ -1,9 +1,9 @@
-"""Counts what a GPU would launch, and how often it would ask the host, in XLA's text of a compiled program.
+"""Counts what a GPU would launch, and how often it would wait for the host, in XLA's text of a compiled program.
 
 The unit is one iteration of the program's outer loop, the lockstep step: kernels outside it are left out, those of a
 loop with a known number of iterations are multiplied, and those of a branch are weighted by how often it runs. A branch
-is a loop of one iteration or none (`sqt_jax.conditional`). The host is asked before each iteration of a loop whose
-number of iterations XLA does not know, and at each conditional.
+is a loop of one iteration or none (`sqt_jax.conditional`). A GPU synchronises with the host at a loop whose number of
+iterations XLA does not know, and at a conditional: the host reads the condition and launches what follows.
 
 CUDA graphs, into which XLA may put kernels that follow one another, are made later and not seen here. Kernels inside a
 library's call (a matrix product, MuJoCo Warp's step) count as one.
@@ -26,7 +26,7 @@ class Launches(NamedTuple):
     """Per lockstep step, by part of it: the innermost of the given scopes that an operation belongs to."""
 
     kernels: dict[str, float]
-    questions: dict[str, float]  # loops and conditionals at which the host is asked
+    host_syncs: dict[str, float]  # loops and conditionals at which the host reads a condition
 
     @property
     def total(self) -> float:
@@ -51,10 +51,10 @@ def count(text: str, parts: Sequence[str], rare: Mapping[str, float]) -> Launche
     """
     blocks, entry = _blocks(text)
     kernels: defaultdict[str, float] = defaultdict(float)
-    questions: defaultdict[str, float] = defaultdict(float)
+    host_syncs: defaultdict[str, float] = defaultdict(float)
     [outer] = [line for line in blocks[entry] if _operation(line) == "while"]
     waiting = [_Block(_target(outer, "body"), _scope(outer), 1.0)]
-    questions["the loop of steps"] = 1.0
+    host_syncs["the loop of steps"] = 1.0
     while waiting:
         block = waiting.pop()
         for line in blocks[block.name]:
@@ -65,14 +65,14 @@ def count(text: str, parts: Sequence[str], rare: Mapping[str, float]) -> Launche
             elif operation in ("while", "conditional"):
                 known = re.search(r'"known_trip_count":\{"n":"(\d+)"\}', line)
                 if not known:
-                    questions[part] += block.times
+                    host_syncs[part] += block.times
                 share = _share(scope, block.scope, rare)
                 times = block.times * (int(known[1]) if known else share)
                 waiting += [_Block(name, scope, times) for name in _run_by(line, operation)]
             elif operation in ("call", "async-start"):
                 name = _target(line, "to_apply") or _target(line, "calls")
                 waiting.append(_Block(name, scope, block.times))
-    return Launches(kernels=dict(kernels), questions=dict(questions))
+    return Launches(kernels=dict(kernels), host_syncs=dict(host_syncs))
 
 
 def _blocks(text: str) -> tuple[dict[str, list[str]], str]:

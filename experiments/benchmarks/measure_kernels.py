@@ -5,13 +5,13 @@ module: `python -m experiments.benchmarks.measure_kernels ALGO TASK PHYSICS MEMB
 """
 
 import json
-import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 
 from experiments.benchmarks import gpu_target, launches
-from experiments.benchmarks.measurements import KERNELS, QUESTIONS, Measurement
+from experiments.benchmarks.measurements import HOST_SYNCS, KERNELS, Measurement
+from experiments.benchmarks.part_process import output_of
 
 # The scopes of a lockstep step (`train.make_trainer`, `rollout.step`, the tasks).
 PARTS = ("act", "physics", "environment", "restart", "observe", "insert", "sample", "update", "feedback", "metrics")
@@ -42,25 +42,17 @@ def compile_and_count(algo: str, task: str, physics: str, members: int) -> launc
     return launches.count(text, PARTS, {"restart": ends, "observe": ends})
 
 
-def run_process(command: Sequence[str]) -> str:
-    """The last line of a process's output. Raises `RuntimeError` with the last line of its errors if it fails."""
-    done = subprocess.run(command, capture_output=True, text=True, env=gpu_target.environment())
-    if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or ["it wrote no error"])[-1])
-    return done.stdout.strip().splitlines()[-1]
-
-
 def bench_kernels(
-    algo: str, task: str, members: int, physics: str, run: Callable[[Sequence[str]], str] = run_process
+    algo: str, task: str, members: int, physics: str, run: Callable[..., str] = output_of
 ) -> Iterator[Measurement]:
-    """Kernels of a lockstep step, and loops and conditionals that ask the host; the parts of each in `what`.
+    """Kernels of a lockstep step, and synchronisations with the host; the parts of each in `what`.
 
     Args:
-      run: as `run_process`.
+      run: as `part_process.output_of`.
     """
     command = [sys.executable, "-m", __name__, algo, task, physics, str(members)]
-    found = launches.Launches(**json.loads(run(command)))
-    for unit, parts in ((KERNELS, found.kernels), (QUESTIONS, found.questions)):
+    found = launches.Launches(**json.loads(run(command, gpu_target.environment())))
+    for unit, parts in ((KERNELS, found.kernels), (HOST_SYNCS, found.host_syncs)):
         ordered = sorted(parts.items(), key=lambda item: -item[1])
         listed = ", ".join(f"{name}: {number:.3g}" for name, number in ordered if number >= 0.05)
         what = f"{algo} on {task}, {physics} ({listed})"

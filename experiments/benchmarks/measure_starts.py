@@ -6,23 +6,17 @@ compilation cache (cold), then with the cache that this left (warm).
 """
 
 import os
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 from experiments.benchmarks.measurements import SECONDS, Measurement
+from experiments.benchmarks.part_process import output_of
 
 FLAGS = ("--steps=2", "--warmup_steps=1", "--batch_size=2", "--eval_every=2", "--eval_episodes=1")
 NO_FILES = ("--checkpoint_every=0", "--notensorboard", "--quiet")
-
-
-def run_process(command: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Runs a command to its end. Raises `RuntimeError` with the last line of its errors if it fails."""
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
 
 
 def bench_starts(
@@ -30,13 +24,13 @@ def bench_starts(
     task: str,
     members: int,
     physics: str,
-    run: Callable[[Sequence[str], Mapping[str, str]], None] = run_process,
+    run: Callable[[Sequence[str], Mapping[str, str]], Any] = output_of,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[Measurement]:
     """Seconds of a cold start, then of a warm one.
 
     Args:
-      run: as `run_process`.
+      run: as `part_process.output_of`.
     """
     seeds = ",".join(map(str, range(members)))
     command = [sys.executable, "-m", "experiments.run", f"--algo={algo}", f"--env={task}", f"--physics={physics}"]

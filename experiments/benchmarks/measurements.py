@@ -19,11 +19,11 @@ from sqt_jax.types import Array
 MEGABYTES = "MB"
 SECONDS = "s"
 KERNELS = "kernels per step"
-QUESTIONS = "questions to the host per step"
+HOST_SYNCS = "host syncs per step"
 GRAPHS = "CUDA graphs per step"
 ERROR = "m/s or rad/s, median error"
 EQUAL = "% of the arrays equal"
-AMOUNTS = (MEGABYTES, SECONDS, KERNELS, QUESTIONS, GRAPHS, ERROR, EQUAL)  # units of a figure that is not a rate
+AMOUNTS = (MEGABYTES, SECONDS, KERNELS, HOST_SYNCS, GRAPHS, ERROR, EQUAL)  # units of a figure that is not a rate
 PROFILED_STEPS = 4  # lockstep steps; the actor learns in half of them
 
 

@@ -84,6 +84,14 @@ def results(
             yield Failure(what, reason(errors.read(), process.returncode))
 
 
+def output_of(command: Sequence[str], environment: Mapping[str, str] | None = None) -> str:
+    """The last line that a process prints, "" if none. Raises `RuntimeError` with the `reason` if it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        raise RuntimeError(reason(done.stderr, done.returncode))
+    return (done.stdout.strip().splitlines() or [""])[-1]
+
+
 def end_with_parent(seconds: float = 1.0) -> None:
     """Ends this process, and those that it started, soon after the one that called `results` has ended: even a killed
     benchmark leaves no process on the GPU.

@@ -12,17 +12,18 @@ def say(*lines: str) -> None:
         print(printable(line), flush=True)
 
 
-def refused_in_one_line(command: Callable[[], int], out: str) -> int:
+def refused_in_one_line(command: Callable[[], int], out: str, os_error: int = BAD_USAGE) -> int:
     """Calls a command and returns its exit code. A `UsageError` or `OSError` becomes one line on stderr.
 
     Args:
       out: the folder of the results, which an `OSError` is about.
+      os_error: the exit code of that.
     """
     try:
         return command()
     except UsageError as error:
-        line = str(error)
+        line, code = str(error), BAD_USAGE
     except OSError as error:
-        line = f"--out={out}: expects a folder that can be written: {error}"
+        line, code = f"--out={out}: expects a folder that can be written: {error}", os_error
     print(printable(line), file=sys.stderr)
-    return BAD_USAGE
+    return code

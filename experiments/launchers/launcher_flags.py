@@ -12,7 +12,7 @@ flags.disclaim_key_flags()  # --help lists a flag with the module that defines i
 
 
 def define(workers: str) -> None:
-    """Defines the flags of all launchers.
+    """Defines the flags of all launchers, and --retries.
 
     Args:
       workers: the help of --workers.
@@ -23,10 +23,6 @@ def define(workers: str) -> None:
     flags.DEFINE_string("slurm", None, "With slurm: options of sbatch, as partition=gpu,gpus_per_node=1,time=04:00:00.")
     define_path("slurm_setup", None, "With slurm: a file of shell lines that each job runs first, as module load cuda.")
     flags.DEFINE_string("ray", None, "With ray: resources of a run, as num_cpus=2,num_gpus=1,resources.NAME=1.")
-
-
-def define_retries() -> None:
-    """Defines --retries."""
     flags.DEFINE_integer("retries", 2, "How often a run is started again that was killed or lost its machine.", 0)
 
 

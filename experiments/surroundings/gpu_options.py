@@ -2,7 +2,7 @@
 
 All are off. They change how kernels are launched, not what they compute. XLA joins kernels that follow one another to
 a CUDA graph, which it calls a command buffer; by default neither loops nor branches are part of one, so that the GPU
-asks the host at each iteration. To use an option, set the variable before the command starts:
+waits for the host at each iteration. To use an option, set the variable before the command starts:
 
     XLA_FLAGS='--xla_gpu_graph_min_graph_size=1' python -m experiments.run --algo=td3_sqt --env=ant
 

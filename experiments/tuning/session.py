@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import optuna
 
-from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED, UsageError, printable
+from experiments.commandline.answers import say
+from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED, UsageError
 from experiments.evidence import formats
 from experiments.evidence.groups import Group
-from experiments.grids.grid import finished
+from experiments.grids.finished import finished
 from experiments.grids.stopping import collected_signals
 from experiments.grids.train_cells import train_cells
 from experiments.launchers.cell import Cell, Ended
@@ -68,7 +69,7 @@ class Session:
             out = self.options.out
             new = [path for path in (out / FILE, out / "lock", out) if not path.exists()]
             try:
-                with folder_lock.locked(out, _say), removed_if_refused(new, out / TRIALS), self.rounds.launcher:
+                with folder_lock.locked(out, say), removed_if_refused(new, out / TRIALS), self.rounds.launcher:
                     return self._tune(env, folder)
             except folder_lock.Busy as busy:
                 raise UsageError(f"--out={out}: {busy} is tuning there; expects another folder") from None
@@ -100,26 +101,26 @@ class Session:
         pace = Pace(members)
         for part in parts:
             if part.study:
-                _say(
+                say(
                     f"{part.task.algo} on {env}: {len(part.study.trials)} of {part.trials} trials were asked for before"
                 )
                 plan = Plan(part.task, options.out, options.seeds, options.objective, part.trials, self.rounds.workers)
-                code = run_study(part.study, plan, self._train, _say, lambda: bool(self.received), pace)
+                code = run_study(part.study, plan, self._train, say, lambda: bool(self.received), pace)
                 if code not in (DONE, DIVERGED):
                     return code
         winners = [Winner(part.task, part.study, part.study.best if part.study else None) for part in parts]
         for winner in winners:
             if winner.trial:
-                _say(f"{winner.task.algo}: the best trial is {winner.trial.number}: {trial_text(winner.trial)}")
+                say(f"{winner.task.algo}: the best trial is {winner.trial.number}: {trial_text(winner.trial)}")
         cells = {
             winner.task.algo: fresh_cell(winner, options.out, self.fresh, self._tuned(winner)) for winner in winners
         }
         if self.received:
             return INTERRUPTED
-        show_only([*cells.values()], options.out, _say)
+        show_only([*cells.values()], options.out, say)
         todo = [cells[w.task.algo] for w in winners if w.is_trained and not finished(cells[w.task.algo])]
         if todo:
-            _say(f"fresh seeds {self.fresh[0]} to {self.fresh[-1]}: {len(todo)} runs{pace.left}")
+            say(f"fresh seeds {self.fresh[0]} to {self.fresh[-1]}: {len(todo)} runs{pace.left}")
         code = self._train(todo, lambda ended: pace.passed(len(self.fresh)))
         if code not in (DONE, DIVERGED):
             return code
@@ -142,7 +143,7 @@ class Session:
 
     def _train(self, cells: Sequence[Cell], on_end: Callable[[Ended], None]) -> int:
         launcher, signals = OpenLauncher(self.rounds.launcher), lambda: len(self.received)
-        return train_cells(cells, launcher, _say, retries=self.retries, signals=signals, on_end=on_end)
+        return train_cells(cells, launcher, say, retries=self.retries, signals=signals, on_end=on_end)
 
     def _tuned(self, winner: Winner) -> str:
         """How a winner was tuned, as its run records it."""
@@ -172,17 +173,13 @@ class Session:
         formats.show([table], "terminal")
         for one in tuned:
             if one.winner.is_trained:
-                _say(report.winner_command(one.winner))
-        _say(f"written to {options.out}: {', '.join(contents)}")
+                say(report.winner_command(one.winner))
+        say(f"written to {options.out}: {', '.join(contents)}")
 
 
 def group_diverged(group: Group) -> list[bool]:
     """Whether each seed of a group diverged."""
     return [bool(np.isnan(member.columns["return_mean"]).any()) for member in group.members]
-
-
-def _say(line: str) -> None:
-    print(printable(line), flush=True)
 
 
 def _joined(values: Sequence[int]) -> str:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from experiments.commandline import flags
 from experiments.commandline.arguments import UsageError
 from experiments.evidence.variants import baseline_of
-from experiments.grids.grid import CELL_FLAGS, check_run_flags
+from experiments.grids.grid import check_run_flags
+from experiments.grids.own_grid import CELL_FLAGS
 from experiments.tuning.space import Axis, axes_of, check_no_flags, grid_size, parse_space
 from sqt_jax import envs
 from sqt_jax.algorithms import ALGORITHMS

@@ -9,7 +9,7 @@ from optuna.trial import FrozenTrial
 
 from experiments.commandline.arguments import DIVERGED, DONE, INTERRUPTED, UsageError
 from experiments.evidence.cells import number
-from experiments.grids.grid import finished
+from experiments.grids.finished import finished
 from experiments.launchers.cell import Cell, Ended
 from experiments.running.progress import format_seconds
 from experiments.tuning.batches import Batch, Task, batches_of, read_results
@@ -69,15 +69,15 @@ def run_study(
       UsageError, OSError: a run cannot be read, or a result not written. Nothing trains any more then.
     """
     pace.passed((len(study.trials) - len(study.running)) * len(plan.seeds), trained=False)
-    untold: list[OSError | UsageError] = []
+    errors: list[OSError | UsageError] = []
 
     def tell_ended(ended: Ended) -> None:
         """Tells the results of a batch; not after an error: what is written after a torn line cannot be read."""
-        if ended.code in (DONE, DIVERGED) and not untold:
+        if ended.code in (DONE, DIVERGED) and not errors:
             try:
                 tell_and_say(ended)
             except (OSError, UsageError) as error:  # raised now, it would kill the batches that still train
-                untold.append(error)
+                errors.append(error)
 
     def tell_and_say(ended: Ended) -> None:
         batch = next(batch for batch in batches().values() if batch.cell == ended.cell)
@@ -101,8 +101,8 @@ def run_study(
         todo = [batch.cell for batch in batches().values() if running & {trial.number for trial in batch.trials}]
         if todo:
             code = train(todo, tell_ended)
-            if untold:
-                raise untold[0]
+            if errors:
+                raise errors[0]
             if code not in (DONE, DIVERGED):
                 return code
         elif len(study.trials) >= plan.trials:
