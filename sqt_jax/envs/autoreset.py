@@ -109,9 +109,12 @@ def make_environment(
       env=env)`.
     """
 
-    def begin(key: Array) -> tuple[State, Array]:
+    # `jit` here and around `step`: JAX then traces once for the warm-up, training and each `vmap` around a restart.
+    def make_start(key: Array) -> tuple[State, Array]:
         task, obs = start(key)
         return task, jnp.asarray(obs, jnp.float32)
+
+    begin = jax.jit(make_start)
 
     def first_timestep(task: State, obs: Array, key: Array, start_key: Array) -> TimeStep:
         finite = in_range(obs)
@@ -136,7 +139,8 @@ def make_environment(
 
     def reset(key: Array) -> TimeStep:
         start_key, next_key = jax.random.split(key)
-        return first_timestep(*begin(start_key), next_key, start_key)
+        task, obs = begin(start_key)
+        return first_timestep(task, obs, next_key, start_key)
 
     def restart(old: tuple[EpisodeState, Array], _: Any) -> tuple[EpisodeState, Array]:
         episode, last_obs = old
@@ -205,7 +209,7 @@ def make_environment(
         action_size=action_size,
         episode_length=episode_length,
         reset=reset,
-        step=step,
+        step=jax.jit(step),
         set_physics=set_physics if place else None,
         status=status,
         min_mean_episode_length=min_mean_episode_length,
