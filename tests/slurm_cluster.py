@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -94,6 +94,22 @@ class Cluster(NamedTuple):
         """The states by job that SLURM remembers: {"3_0": "RUNNING"}."""
         return dict(line.split() for line in self.call("squeue", "-h", "-r", "-t", "all", "-o", "%i %T").splitlines())
 
+    def bring_back(self, node: str) -> bool:
+        """Asks SLURM to use a node again that is down or drained; returns whether it does."""
+        with suppress(subprocess.CalledProcessError):  # it may be back already
+            self.call("scontrol", "update", f"NodeName={node}", "State=RESUME")
+        state = self.call("sinfo", "-h", "-N", "-n", node, "-o", "%T")
+        return not state.startswith(("down", "drain"))
+
+    def wait_until_idle(self) -> None:
+        """Waits until all nodes are free. Raises `TimeoutError`."""
+        _wait_until(lambda: _all_idle(self), self.folder)
+
+    def describe(self) -> str:
+        """Its nodes, its jobs and what its controller wrote last."""
+        log = (self.folder / "slurmctld.log").read_text()[-4000:]
+        return "\n".join([self.call("sinfo", "-N", "-l"), self.call("squeue", "-r", "-t", "all"), log])
+
 
 @contextmanager
 def cluster(requeue_seconds: int = 6, hidden: Path | None = None) -> Iterator[Cluster]:
@@ -138,7 +154,7 @@ def cluster(requeue_seconds: int = 6, hidden: Path | None = None) -> Iterator[Cl
             if hidden and name == NODES[-1]:
                 command = ["unshare", "-m", "sh", "-c", 'mount -t tmpfs none "$0" && exec "$@"', str(hidden), *command]
             start(*command)
-        _wait_until(lambda: _idle(running) == len(NODES), folder)
+        running.wait_until_idle()
         stack.callback(_end_jobs, running)
         yield running
 
@@ -152,11 +168,11 @@ def main(command: Sequence[str]) -> int:
         return subprocess.run(command, env=running.variables).returncode
 
 
-def _idle(running: Cluster) -> int:
+def _all_idle(running: Cluster) -> bool:
     try:
-        return running.call("sinfo", "-h", "-N", "-o", "%T").split().count("idle")
+        return running.call("sinfo", "-h", "-N", "-o", "%T").split() == ["idle"] * len(NODES)
     except subprocess.SubprocessError:
-        return 0
+        return False
 
 
 def _end_jobs(running: Cluster) -> None:

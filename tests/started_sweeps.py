@@ -15,7 +15,7 @@ from experiments.launchers import tied
 
 ROOT = Path(__file__).resolve().parent.parent
 GRID = ["--algos=td3,td3_sqt,td3_sqt_tuple", "--tasks=hopper", "--physics=mujoco", "--seeds=0,1", "--split=seeds:1"]
-GRID += ["--steps=6000", "--warmup_steps=100", "--eval_every=2000", "--checkpoint_every=1000", "--eval_episodes=1"]
+GRID += ["--steps=12000", "--warmup_steps=100", "--eval_every=2000", "--checkpoint_every=1000", "--eval_episodes=1"]
 GRID += ["--batch_size=8", "--hidden=8", "--quiet", "--notensorboard"]
 
 
@@ -28,7 +28,7 @@ class Run:
         self.path = Path(flags["out"]) / flags["env"] / flags["algo"] / flags["name"]
 
     def is_half_done(self) -> bool:
-        """Whether it has been evaluated after its start, and is not at its end."""
+        """Whether it has been evaluated after its start, and is far from its end: a signal still finds it."""
         table = self.path / "evaluations.csv"
         return table.exists() and 3 <= table.read_text().count("\n") < 5
 

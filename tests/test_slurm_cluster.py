@@ -47,9 +47,17 @@ def hidden(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def slurm(hidden):
+def cluster(hidden):
     with slurm_cluster.cluster(hidden=hidden if slurm_cluster.can_hide() else None) as running:
         yield running
+
+
+@pytest.fixture
+def slurm(cluster):
+    for node in slurm_cluster.NODES:
+        cluster.bring_back(node)  # SLURM drains a node where a killed process takes long to end
+    cluster.wait_until_idle()
+    return cluster
 
 
 class Sweep:
@@ -95,15 +103,14 @@ class Sweep:
     def saved_and_runs(self, cell):
         return any(cell.path.glob("checkpoint/step_*")) and self.state(cell) == "RUNNING"
 
-
-def wait_until(condition, process):
-    """Waits for a condition while a sweep runs; returns its value."""
-    give_up = time.monotonic() + PATIENCE
-    while not (found := condition()):
-        assert time.monotonic() < give_up, "waited too long"
-        assert process.poll() is None, process.communicate()[0]
-        time.sleep(0.1)
-    return found
+    def wait_until(self, condition, process):
+        """Waits for a condition while the sweep runs; returns its value."""
+        give_up = time.monotonic() + PATIENCE
+        while not (found := condition()):
+            assert time.monotonic() < give_up, f"waited too long\n{self.slurm.describe()}"
+            assert process.poll() is None, f"{process.communicate()[0]}\n{self.slurm.describe()}"
+            time.sleep(0.1)
+        return found
 
 
 def send(sweep, name, job):
@@ -130,16 +137,15 @@ def stopped(sweep, cell):
 
 def reach_time_limit(sweep, cell, process):
     with stopped(sweep, cell):
-        wait_until(lambda: "SIGUSR2 received" in sweep.printed_by_job(cell), process)
+        sweep.wait_until(lambda: "SIGUSR2 received" in sweep.printed_by_job(cell), process)
 
 
 def lose_node(sweep, cell, process):
     """The node of the cell's job goes down, and comes back when the job has left it."""
     node = sweep.slurm.call("squeue", "-h", "-j", sweep.job(cell), "-o", "%B")
     sweep.slurm.call("scontrol", "update", f"NodeName={node}", "State=DOWN", "Reason=test")
-    wait_until(lambda: sweep.state(cell) != "RUNNING", process)
-    with suppress(subprocess.CalledProcessError):  # it may be back already
-        sweep.slurm.call("scontrol", "update", f"NodeName={node}", "State=RESUME")
+    sweep.wait_until(lambda: sweep.state(cell) != "RUNNING", process)
+    sweep.wait_until(lambda: sweep.slurm.bring_back(node), process)
 
 
 def rows(cell):
@@ -180,7 +186,7 @@ def test_what_happens_to_jobs_does_not_change_a_row(slurm, tmp_path):
         limited: lambda: reach_time_limit(sweep, limited, process),
     }
     while events:
-        ready = wait_until(lambda: [cell for cell in events if sweep.saved_and_runs(cell)], process)
+        ready = sweep.wait_until(lambda: [cell for cell in events if sweep.saved_and_runs(cell)], process)
         for cell in ready:
             events.pop(cell)()
     printed, _ = process.communicate(timeout=PATIENCE)
@@ -203,10 +209,10 @@ def test_a_user_may_cancel_one_job_or_all(slurm, tmp_path):
     sweep = Sweep(slurm, tmp_path, "lr=0.001,0.0003", "--launcher=slurm", "--max_jobs=2", steps=1000000)
     cancelled, saved, second, dropped = sweep.cells
     process = sweep.start()
-    wait_until(lambda: sweep.saved_and_runs(cancelled), process)
+    sweep.wait_until(lambda: sweep.saved_and_runs(cancelled), process)
     assert sweep.state(second) == "PENDING"  # two jobs at a time
     slurm.call("scancel", sweep.job(cancelled))
-    wait_until(lambda: sweep.saved_and_runs(saved) and sweep.state(second) == "RUNNING", process)
+    sweep.wait_until(lambda: sweep.saved_and_runs(saved) and sweep.state(second) == "RUNNING", process)
     process.send_signal(signal.SIGINT)
     printed, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, printed
