@@ -3,7 +3,8 @@
 A row is drawn with probability proportional to its priority. Priorities are stored in blocks of 128, with a level of
 sums of blocks, a level of sums of those, and so on. A draw reads one block of each level, a new priority rewrites one
 sum of each level; neither depends on the capacity. A sum is always computed from its block, never adjusted: rounding
-errors cannot accumulate.
+errors cannot accumulate. The largest priority of each block is kept too, so that the largest of all is found without a
+branch.
 """
 
 import math
@@ -23,6 +24,7 @@ class LapState(NamedTuple):
 
     rows: RingState
     levels: tuple[Array, ...]  # [blocks, BLOCK] each: priorities, sums of their blocks, ...; the last has one block
+    block_max: Array  # [blocks]: the largest priority of each block
     max_priority: Array  # []: the priority of new rows
 
 
@@ -92,7 +94,13 @@ def lap(
 
     def init() -> LapState:
         levels = tuple(jnp.zeros(shape) for shape in _shapes(ring.capacity))
-        return LapState(ring.init(), levels, jnp.ones(()))
+        return LapState(ring.init(), levels, jnp.zeros(len(levels[0])), jnp.ones(()))
+
+    def with_priorities(state: LapState, index: Array, value: Array) -> LapState:
+        """The state with the priorities `value [B]` of the rows `index [B]`."""
+        levels, block = set_priorities(state.levels, index, value), index // BLOCK
+        block_max = state.block_max.at[block].set(jnp.max(levels[0][block], axis=-1))
+        return state._replace(levels=levels, block_max=block_max)
 
     def insert(state: LapState, transition: Transition) -> LapState:
         rows, lost = ring.insert(state.rows, transition)
@@ -101,7 +109,7 @@ def lap(
         gone = lost >= jnp.maximum(rows.inserted - ring.capacity, 0)
         index = jnp.concatenate([new, jnp.where(gone, lost % ring.capacity, new)])
         value = jnp.where(jnp.concatenate([jnp.zeros_like(gone), gone]), 0.0, state.max_priority)
-        return LapState(rows, set_priorities(state.levels, index, value), state.max_priority)
+        return with_priorities(state._replace(rows=rows), index, value)
 
     def sample(state: LapState, key: Array) -> tuple[Transition, Array]:
         index = draw_rows(key, state.levels, batch_size)
@@ -111,20 +119,20 @@ def lap(
         new = priority(td_error, priority_exponent, min_priority)
         highest = jnp.maximum(state.max_priority, jnp.max(new))
         available = state.levels[0][index // BLOCK, index % BLOCK] > 0  # not lost since it was drawn
-        levels = set_priorities(state.levels, index, jnp.where(available, new, 0.0))
-        # Members share the condition: a real branch under vmap. It reads every priority, so it must stay rare.
+        state = with_priorities(state, index, jnp.where(available, new, 0.0))
         refresh = step % refresh_every == 0
-        highest = jax.lax.cond(refresh, lambda: jnp.max(levels[0]), lambda: highest)
-        return LapState(state.rows, levels, highest)
+        return state._replace(max_priority=jnp.where(refresh, jnp.max(state.block_max), highest))
 
     def rows(state: LapState, first: Array | int, count: int) -> Array:
         return ring.rows(state.rows, first, count)
 
     def with_rows(state: LapState, rows: Array, first: Array | int) -> LapState:
-        return state._replace(rows=ring.with_rows(state.rows, rows, first))
+        # Checkpoints have the priorities without their blocks' largest ones.
+        block_max = jnp.max(state.levels[0], axis=-1)
+        return state._replace(rows=ring.with_rows(state.rows, rows, first), block_max=block_max)
 
     def without_rows(state: LapState) -> LapState:
-        return state._replace(rows=ring.without_rows(state.rows))
+        return state._replace(rows=ring.without_rows(state.rows), block_max=None)
 
     def size(state: LapState) -> Array:
         return ring.size(state.rows)
@@ -139,5 +147,5 @@ def lap(
         rows=rows,
         with_rows=with_rows,
         without_rows=without_rows,
-        member_axes=LapState(rows=ring.member_axes(), levels=0, max_priority=0),  # type: ignore[arg-type]
+        member_axes=LapState(rows=ring.member_axes(), levels=0, block_max=0, max_priority=0),  # type: ignore[arg-type]
     )

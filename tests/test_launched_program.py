@@ -37,4 +37,4 @@ def test_a_step_has_no_more_loops_and_branches_than_these(algo, learn):
         several_updates, delayed_actor, copies = config.train.updates_per_step > 1, config.agent.policy_delay > 1, td7
         loops += several_updates + delayed_actor + copies
     assert len(re.findall(r"stablehlo\.while", text)) == loops
-    assert len(re.findall(r"stablehlo\.(?:case|if)\b", text)) == (td7 and learn)  # LAP's largest priority
+    assert not re.search(r"stablehlo\.(?:case|if)\b", text)
