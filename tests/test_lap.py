@@ -378,7 +378,8 @@ def held_shapes(state):
 
 
 def shape_in_text(leaf):
-    return f"{ {'float32': 'f32', 'int32': 's32'}[leaf.dtype.name]}[{','.join(map(str, leaf.shape))}]"
+    kind = {"float32": "f32", "int32": "s32"}[leaf.dtype.name]
+    return f"{kind}[{','.join(map(str, leaf.shape))}]"
 
 
 def instructions(text):
