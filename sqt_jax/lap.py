@@ -132,7 +132,7 @@ def lap(
         return state._replace(rows=ring.with_rows(state.rows, rows, first), block_max=block_max)
 
     def without_rows(state: LapState) -> LapState:
-        return state._replace(rows=ring.without_rows(state.rows), block_max=None)
+        return state._replace(rows=ring.without_rows(state.rows), block_max=None)  # type: ignore[arg-type]
 
     def size(state: LapState) -> Array:
         return ring.size(state.rows)
