@@ -29,6 +29,9 @@ STATE = (
     | mujoco.mjtState.mjSTATE_CTRL
 )
 
+# The quantities that are not zero in a robot without forces.
+MOTION = {"cinert", "cvel"}
+
 
 def make(setup: Setup, num_threads: int | None = None) -> Physics:
     """MuJoCo's C library.
@@ -45,11 +48,27 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
         raise ValueError(f"the model: expected no activation states, got {model.na}")
     if num_threads is not None and num_threads < 1:
         raise ValueError(f"num_threads: expected a whole number of at least 1, got {num_threads}")
-    placed_quantities = _placed_quantities(setup)
     stepper = Stepper(setup, num_threads or usable_cores())
     num_places = model.nq + model.nv
     # A header (0: just placed, the words are float32; 1: stepped, they are float64), x of the tracked point, STATE.
     state_words = 1 + 2 * (1 + num_places + model.nv)
+
+    def by_name(quantities: Array) -> dict[str, Array]:
+        if not setup.quantities:
+            return {}
+        return dict(zip(setup.quantities, jnp.split(quantities, stepper.quantity_splits), strict=True))
+
+    def measured_at(words: np.ndarray) -> np.ndarray:
+        """Words of positions and velocities [..., nq + nv] -> words of the quantities [..., Q]."""
+        rows = np.ascontiguousarray(words).view(np.float32).reshape(-1, num_places)
+        return stepper.placed_quantities(rows).view(np.uint32).reshape(*words.shape[:-1], -1)
+
+    measure_on_host = _on_host(measured_at, stepper.num_quantities)
+
+    def placed_quantities(words: Array) -> dict[str, Array]:
+        if MOTION.isdisjoint(setup.quantities):
+            return by_name(jnp.zeros(stepper.num_quantities))
+        return by_name(_floats(measure_on_host(words)))
 
     def place(qpos: Array, qvel: Array) -> PhysicsState:
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
@@ -59,11 +78,11 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
             qpos=qpos,
             qvel=qvel,
             displacement=jnp.zeros((), jnp.float32),
-            quantities=placed_quantities(qpos, qvel),
+            quantities=placed_quantities(words),
             internal=internal,
         )
 
-    def host(packed: np.ndarray) -> np.ndarray:
+    def stepped(packed: np.ndarray) -> np.ndarray:
         """Words of states and controls [..., W + nu] -> words of states and of the measured numbers [..., W + F]."""
         words = packed.reshape(-1, packed.shape[-1])
         rows = np.empty((len(words), (state_words - 1) // 2 + model.nu))
@@ -82,28 +101,16 @@ def make(setup: Setup, num_threads: int | None = None) -> Physics:
         out[:, state_words:] = measured.view(np.uint32)
         return out.reshape(*packed.shape[:-1], -1)
 
-    def host_in_place(context: Any, out: Any, packed: Any) -> None:
-        del context
-        np.asarray(out)[...] = host(np.asarray(packed))
-
-    shape = jax.ShapeDtypeStruct((state_words + stepper.num_measured,), jnp.uint32)
-    # On a CPU the callback gets the buffers themselves. JAX arrays would be 15 times slower, and may deadlock
-    # (https://github.com/jax-ml/jax/issues/24255).
-    on_cpu = buffer_callback(host_in_place, shape, vmap_method="broadcast_all")
-
-    def elsewhere(packed: Array) -> Array:
-        return jax.pure_callback(lambda words: host(np.asarray(words)), shape, packed, vmap_method="broadcast_all")
+    step_on_host = _on_host(stepped, state_words + stepper.num_measured)
 
     def advance(state: PhysicsState, control: Array) -> PhysicsState:
-        packed = jnp.concatenate([state.internal, _bits(jnp.asarray(control, jnp.float32))])
-        out = jax.lax.platform_dependent(packed, cpu=on_cpu, default=elsewhere)
-        measured = jax.lax.bitcast_convert_type(out[state_words:], jnp.float32)
-        qpos, qvel, displacement, *quantities = jnp.split(measured, stepper.splits)
+        out = step_on_host(jnp.concatenate([state.internal, _bits(jnp.asarray(control, jnp.float32))]))
+        qpos, qvel, displacement, quantities = jnp.split(_floats(out[state_words:]), stepper.splits)
         return PhysicsState(
             qpos=qpos,
             qvel=qvel,
             displacement=displacement[0],
-            quantities=dict(zip(setup.quantities, quantities, strict=True)),
+            quantities=by_name(quantities),
             internal=out[:state_words],
         )
 
@@ -125,9 +132,10 @@ class Stepper:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # The `MjData` that no thread is using. Calls are concurrent if members are on several XLA devices.
         self.idle = [data := mujoco.MjData(self.model)]
-        sizes = [self.model.nq, self.model.nv, 1] + [getattr(data, name).size for name in setup.quantities]
-        self.num_measured = sum(sizes)
-        self.splits = np.cumsum(sizes)[:-1].tolist()
+        sizes = [getattr(data, name).size for name in setup.quantities]
+        self.num_quantities, self.quantity_splits = sum(sizes), np.cumsum(sizes)[:-1].tolist()
+        self.splits = np.cumsum([self.model.nq, self.model.nv, 1]).tolist()  # of what `__call__` returns
+        self.num_measured = self.splits[-1] + self.num_quantities
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Step `rows` [R, 1 + nq + 2 nv + nu] (x of the tracked point, then STATE) in place.
@@ -138,7 +146,7 @@ class Stepper:
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(_ignore_warning)
         measured = np.empty((len(rows), self.num_measured), np.float32)
-        displacement, first_quantity = self.splits[1], self.splits[1] + 1
+        _, displacement, first_quantity = self.splits
         numbers = itertools.count()  # the next row to be stepped; `next` is atomic
 
         def work() -> None:
@@ -169,8 +177,7 @@ class Stepper:
             if self.setup.quantities:
                 if "cfrc_ext" in self.setup.quantities:
                     mujoco.mj_rnePostConstraint(model, data)
-                fields = [getattr(data, name).ravel() for name in self.setup.quantities]
-                measured[i, first_quantity:] = np.concatenate(fields)
+                measured[i, first_quantity:] = self.quantities(data)
 
         if len(rows) == 1:
             work()
@@ -181,6 +188,22 @@ class Stepper:
         stable = np.all(np.abs(rows) < mujoco.mjMAXVAL, axis=1)
         measured[~stable] = np.nan
         return measured
+
+    def placed_quantities(self, rows: np.ndarray) -> np.ndarray:
+        """The quantities [R, Q] float32 of robots that were just placed at `rows` [R, nq + nv], without forces."""
+        quantities = np.empty((len(rows), self.num_quantities), np.float32)
+        model, data = self.model, mujoco.MjData(self.model)
+        for i, row in enumerate(rows):
+            data.qpos, data.qvel = row[: model.nq], row[model.nq :]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            quantities[i] = self.quantities(data)
+        return quantities
+
+    def quantities(self, data: mujoco.MjData) -> np.ndarray:
+        """The setup's quantities, one after another: [Q]"""
+        return np.concatenate([getattr(data, name).ravel() for name in self.setup.quantities])
 
     def tracked(self, data: mujoco.MjData) -> float:
         """x of the tracked point, m."""
@@ -195,14 +218,29 @@ def _bits(x: Array) -> Array:
     return jax.lax.bitcast_convert_type(x, jnp.uint32)
 
 
-def _placed_quantities(setup: Setup) -> Callable[[Array, Array], dict[str, Array]]:
-    """A function (qpos, qvel) -> the quantities of a robot that was just placed there.
+def _floats(words: Array) -> Array:
+    return jax.lax.bitcast_convert_type(words, jnp.float32)
 
-    Computed by MJX: its kinematics are exact to float32, and cheaper than a call to the host for every possible start.
+
+def _on_host(function: Callable[[np.ndarray], np.ndarray], num_words: int) -> Callable[[Array], Array]:
+    """A pure NumPy function of words [..., W] -> [..., `num_words`] as a function of JAX arrays [W] -> [`num_words`].
+
+    Under `vmap` all entries go to the host in one call.
     """
-    if not setup.quantities:
-        return lambda qpos, qvel: {}
-    from sqt_jax.envs.physics import mjx
+    shape = jax.ShapeDtypeStruct((num_words,), jnp.uint32)
 
-    place = mjx.make(setup).place
-    return lambda qpos, qvel: place(qpos, qvel).quantities
+    def in_place(context: Any, out: Any, words: Any) -> None:
+        del context
+        np.asarray(out)[...] = function(np.asarray(words))
+
+    # On a CPU the callback gets the buffers themselves. JAX arrays would be 15 times slower, and may deadlock
+    # (https://github.com/jax-ml/jax/issues/24255).
+    on_cpu = buffer_callback(in_place, shape, vmap_method="broadcast_all")
+
+    def elsewhere(words: Array) -> Array:
+        return jax.pure_callback(lambda words: function(np.asarray(words)), shape, words, vmap_method="broadcast_all")
+
+    def call(words: Array) -> Array:
+        return jax.lax.platform_dependent(words, cpu=on_cpu, default=elsewhere)
+
+    return call
