@@ -1,6 +1,7 @@
 """Command lines of the commands that read runs: flags, error lines, exit codes, written files."""
 
 import argparse
+from pathlib import Path
 
 import pytest
 
@@ -84,6 +85,15 @@ def test_folders_that_cannot_be_written(tmp_path):
     (tmp_path / "a.csv").mkdir()
     with pytest.raises(UsageError, match="a.csv is a folder"):
         arguments.reject_existing(tmp_path, ["a.csv"], overwrite=True)
+
+
+def test_a_folder_is_checked_by_writing(tmp_path):
+    """The system says that root may write into /proc, and refuses when it does."""
+    arguments.reject_folder("--out", tmp_path / "a" / "b")
+    assert not any(tmp_path.iterdir())
+    if Path("/proc/self").exists():
+        with pytest.raises(UsageError, match="^--out=/proc/x: expects a folder that can be written"):
+            arguments.reject_folder("--out", Path("/proc/x"))
 
 
 def test_a_link_is_replaced_and_not_written_through(tmp_path):

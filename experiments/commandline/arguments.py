@@ -7,6 +7,7 @@ import argparse
 import difflib
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -146,9 +147,15 @@ def reject_folder(flag: str, path: Path) -> None:
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Whether files can be created in a folder or, if it does not exist, the folder itself can be created."""
+    """Whether files can be created in a folder or, if it does not exist, the folder itself can be created.
+
+    Raises `OSError` with the reason where the system says no only when it is tried, as in /proc.
+    """
     nearest = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
-    return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+        return False
+    with tempfile.TemporaryDirectory(prefix=".sqt_jax_", dir=nearest):
+        return True
 
 
 def write_file(out: Path, content: bytes) -> None:
