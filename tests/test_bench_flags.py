@@ -54,6 +54,10 @@ def test_an_empty_list_is_rejected_except_of_suites(flag):
             {"suites": ["update", "growth"], "members": ["1", "5"]},
             "--members: expects one number with the suite growth, not 1,5",
         ),
+        (
+            {"suites": ["gpu"], "members": ["1", "2", "3", "4"]},
+            "--members: expects at most three numbers with --suite=gpu, not 1,2,3,4$",
+        ),
         ({"compare": ["sbx"], "algos": ["td7"]}, "--algos: expects some of td3, sac with --compare=sbx"),
         ({"json": "/no/such/folder/bench.json"}, "--json: expects a file in an existing folder"),
         ({"json": "/"}, "--json: expects a file in an existing folder"),

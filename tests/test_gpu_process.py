@@ -1,13 +1,11 @@
 """The measurements of a part's process, at tiny sizes on this machine."""
 
-import json
-
 import pytest
 
 from experiments.benchmarks import gpu_process
 from experiments.benchmarks.gpu_trace import Work
+from experiments.benchmarks.measure_gpu import Part, bench_gpu
 from experiments.benchmarks.measurements import ERROR, GRAPHS, HOST_SYNCS, KERNELS, Failure, Measurement, Prepared
-from experiments.benchmarks.part_process import parsed
 from experiments.gymnasium_parity.trajectories import StepErrors
 
 
@@ -41,12 +39,15 @@ def test_a_profile_gives_counts_of_one_step(monkeypatch):
 
 
 @pytest.mark.slow
-def test_every_kind_runs_here(capsys, monkeypatch):
-    monkeypatch.setattr(gpu_process.simulators, "LACKS", {})
+def test_loop_parity_and_profile_run_here():
+    """In processes of their own, as in the suite."""
     case = {"algo": "td3_sqt", "task": "cheetah", "physics": "mujoco", "members": 1}
-    gpu_process.main("loop", json.dumps({**case, "seconds": 0.0, "repeats": 1}))
-    gpu_process.main("parity", json.dumps({"task": "cheetah", "physics": "mujoco"}))
-    gpu_process.main("profile", json.dumps(case))
-    rows = [row for text in capsys.readouterr().out.splitlines() if (row := parsed(text))]
-    assert [row.suite for row in rows] == ["loop", "parity", *["profile"] * 3]
-    assert rows[0].rate > 0 and rows[1].rate < 1e-5 and rows[2].rate > 10
+    parts = [
+        Part("loop", {**case, "seconds": 0.0, "repeats": 1}, 300),
+        Part("parity", {"task": "cheetah", "physics": "mjx"}, 300),
+        Part("profile", case, 300),
+    ]
+    rows = list(bench_gpu(parts))
+    found = [row for row in rows if row.suite != "seconds"]
+    assert [row.suite for row in found] == ["loop", "parity", *["profile"] * 3] and len(rows) == len(found) + 3
+    assert found[0].rate > 0 and 0 < found[1].rate < 2e-5 and found[2].rate > 10

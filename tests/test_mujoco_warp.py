@@ -8,10 +8,8 @@ import pytest
 pytest.importorskip("warp", reason="the extra `warp` is not installed")
 
 from experiments.gymnasium_parity.trajectories import compare_steps  # noqa: E402
-from experiments.surroundings import gpu_options  # noqa: E402
 from sqt_jax import envs  # noqa: E402
 from sqt_jax.envs import physics  # noqa: E402
-from sqt_jax.envs.physics import mujoco_warp  # noqa: E402
 
 pytestmark = pytest.mark.slow  # Warp compiles each kernel separately
 
@@ -33,20 +31,6 @@ def test_ants_median_step_is_near_mujocos():
     """Not its 95 %: Warp's frame of a steep capsule's contact is not MuJoCo's."""
     found = compare_steps("ant", envs.make("ant", "warp"), 64)
     assert found.qvel_median <= 2e-5 and found.terminations_agree == 1
-
-
-@pytest.mark.parametrize(
-    ("backend", "flags", "mode"),
-    [
-        ("cpu", "--xla_gpu_enable_command_buffer=+WHILE", "NONE"),
-        ("gpu", "--xla_gpu_graph_min_graph_size=1", "WARP"),
-        ("gpu", "--xla_gpu_enable_command_buffer=+CONDITIONAL --xla_a=WHILE", "WARP"),
-        ("gpu", gpu_options.OPTIONS["loops"].flags, "JAX"),
-    ],
-)
-def test_a_call_is_part_of_xlas_graph_only_if_loops_are(monkeypatch, backend, flags, mode):
-    monkeypatch.setenv("XLA_FLAGS", flags)
-    assert mujoco_warp._graph_mode(backend).name == mode
 
 
 def test_members_and_environments_are_one_batch_of_worlds():

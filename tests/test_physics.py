@@ -8,9 +8,8 @@ import pytest
 from sqt_jax import envs
 from sqt_jax.envs import physics
 
-
-def gpu(version):
-    return [types.SimpleNamespace(platform="gpu", client=types.SimpleNamespace(platform_version=version))]
+GPU = types.SimpleNamespace(platform="gpu")
+CPU = jax.devices("cpu")[0]
 
 
 def test_every_physics_is_a_module_that_can_be_found():
@@ -30,17 +29,23 @@ def test_warp_needs_its_package(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("devices", "missing"),
+    ("first", "platforms", "missing"),
     [
-        (jax.devices("cpu"), "an NVIDIA GPU as JAX's device, which is cpu"),
-        (gpu("PJRT C API\nrocm 70100"), "an NVIDIA GPU as JAX's device, which is gpu"),
-        (gpu("PJRT C API\ncuda 12090"), ""),
+        (CPU, {"cpu": [CPU]}, "an NVIDIA GPU as JAX's device, which is cpu"),
+        (CPU, {"cpu": [CPU], "cuda": [GPU]}, "an NVIDIA GPU as JAX's device, which is cpu"),  # JAX_PLATFORMS=cpu,cuda
+        (GPU, {"cpu": [CPU], "rocm": [GPU]}, "an NVIDIA GPU as JAX's device, which is gpu"),
+        (GPU, {"cpu": [CPU], "cuda": [GPU]}, ""),
     ],
-    ids=["cpu", "rocm", "cuda"],
+    ids=["cpu", "cpu first", "rocm", "cuda"],
 )
-def test_warp_needs_an_nvidia_gpu(monkeypatch, devices, missing):
+def test_warp_needs_an_nvidia_gpu(monkeypatch, first, platforms, missing):
+    def devices(platform=None):
+        if platform and platform not in platforms:
+            raise RuntimeError(f"Unknown backend {platform}")  # as JAX
+        return platforms[platform] if platform else [first]
+
     monkeypatch.setattr(physics, "find_spec", lambda name: object())
-    monkeypatch.setattr(jax, "devices", lambda: devices)
+    monkeypatch.setattr(jax, "devices", devices)
     assert physics.lacks("warp") == missing
 
 

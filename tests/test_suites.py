@@ -32,12 +32,13 @@ def test_every_suite_makes_its_measurements(monkeypatch):
     monkeypatch.setattr(suites.compare, "compare", lambda *case, **timing: made.append(("compare", *case)) or [])
     monkeypatch.setattr(suites.measure_gpu, "parts_of", lambda *case, **timing: (*case, *timing.values()))
     monkeypatch.setattr(
-        suites.measure_gpu, "bench_gpu", lambda parts, patience: made.append(("gpu", *parts, patience)) or []
+        suites.measure_gpu, "bench_gpu", lambda parts, *times: made.append(("gpu", *parts, *times)) or []
     )
     asked = request(
         suites=[*suites.SUITES, *suites.MORE_SUITES],
         parts=["loops"],
         patience=2.0,
+        minutes=9.0,
         tasks=["ant"],
         algos=["td3", "td7"],
         physics=["mjx"],
@@ -66,7 +67,7 @@ def test_every_suite_makes_its_measurements(monkeypatch):
         ("kernels", "td7", "ant", 5, "warp"),
         ("starts", "td3", "ant", 5, "mjx"),
         ("starts", "td7", "ant", 5, "mjx"),
-        ("gpu", ["loops"], "ant", [5], ["mjx"], 0.0, 3, 2.0),
+        ("gpu", ["loops"], "ant", [5], ["mjx"], 0.0, 3, 2.0, 9.0),
         ("growth", ["td3", "td7"], "ant", 5),
         ("compare", "sbx", "td3", "ant", 5, ["mjx"], "python", {}),
     ]

@@ -46,12 +46,16 @@ flags.DEFINE_list("tasks", list(PAPERS_TASKS), "Tasks. The suites replay, growth
 flags.DEFINE_list(
     "physics",
     None,
-    "Physics of the suites env, loop, memory, batches, starts and kernels. Default: every physics of this machine "
-    "(kernels, which needs no GPU: mjx and warp).",
+    "Physics of the suites env, loop, memory, batches, starts, kernels and gpu. Default: every physics of this machine "
+    "(kernels, which needs no GPU: mjx and warp; --suite=gpu: all).",
 )
 flags.DEFINE_list("solver", [], "More limits of MJX's solver for the suite physics: iterations/line-search steps.")
 flags.DEFINE_list("algos", ["td3", "sac", "td7"], "Algorithms of all suites except env, physics and replay.")
-flags.DEFINE_list("members", ["1", "5"], "Numbers of members.")
+flags.DEFINE_list(
+    "members",
+    ["1", "5"],
+    "Numbers of members. With --suite=gpu up to three: of all parts, of MuJoCo C's largest loop, of Warp's.",
+)
 flags.DEFINE_list(
     "devices", ["auto"], "Numbers of devices for the members of the suites update and loop; auto: as in a run."
 )
@@ -62,6 +66,9 @@ flags.DEFINE_list(
     "parts", list(measure_gpu.PARTS), f"Parts of the suite gpu, made in this order: {', '.join(measure_gpu.PARTS)}."
 )
 flags.DEFINE_float("patience", 1.0, "Factor of the limits of time of these parts, for a slow machine.", lower_bound=0.0)
+flags.DEFINE_float(
+    "minutes", measure_gpu.MINUTES, "Minutes of all these parts together; the last ones are left out.", lower_bound=0.0
+)
 define_path("figures", "bench", "Folder of the suite growth's figures.")
 flags.DEFINE_list(
     "compare", [], f"Other implementations to measure, interleaved with ours: {', '.join(compare.NEEDS)}."
@@ -99,6 +106,8 @@ def check_flags() -> None:
     solver_limits()
     if "growth" in FLAGS.suites and len(FLAGS.members) != 1:
         sys.exit(f"--members: expects one number with the suite growth, not {','.join(FLAGS.members)}")
+    if "gpu" in FLAGS.suites and len(FLAGS.members) > 3:
+        sys.exit(f"--members: expects at most three numbers with --suite=gpu, not {','.join(FLAGS.members)}")
     if "kernels" in FLAGS.suites:
         check_kernels()
     if FLAGS.json and (Path(FLAGS.json).is_dir() or not Path(FLAGS.json).absolute().parent.is_dir()):
@@ -193,6 +202,7 @@ def request() -> Request:
         profile=FLAGS.profile,
         parts=FLAGS.parts,
         patience=FLAGS.patience,
+        minutes=FLAGS.minutes,
         compare=FLAGS.compare,
         peer_python=FLAGS.peer_python,
     )

@@ -4,7 +4,7 @@
     python -m experiments.benchmarks.gpu_bundle unpack FOLDER SITE    # there: installs into the folder SITE
 
 `pack` downloads the wheels of `PACKAGES` in the versions of constraints.txt and cuts them, so that each numbered folder
-has at most 60 MiB and can be sent alone. `unpack` takes the numbered folders, or the folder above them, from wherever
+has at most 52 MiB and can be sent alone. `unpack` takes the numbered folders, or the folder above them, from wherever
 they arrived. It checks every SHA-256, joins the wheels and installs them with pip. It needs Python and pip only.
 PYTHONPATH=SITE makes Python find them.
 """
@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 
 from experiments.commandline.arguments import BAD_USAGE, UsageError
 
-PIECE_BYTES = 60 * 2**20  # of one numbered folder
+# Of one numbered folder: where 64 MiB can be sent at once, the repository's own files, 8 MiB, travel with it.
+PIECE_BYTES = 52 * 2**20
 MANIFEST = "manifest.json"
 PYTHON = "3.12"
 CONSTRAINTS = Path(__file__).parents[2] / "constraints.txt"

@@ -2,8 +2,9 @@
 
 The unit is one iteration of the program's outer loop, the lockstep step: kernels outside it are left out, those of a
 loop with a known number of iterations are multiplied, and those of a branch are weighted by how often it runs. A branch
-is a loop of one iteration or none (`sqt_jax.conditional`). A GPU synchronises with the host at a loop whose number of
-iterations XLA does not know, and at a conditional: the host reads the condition and launches what follows.
+is a loop of one iteration or none (`sqt_jax.conditional`), so our programs have no conditionals. A GPU synchronises
+with the host at a loop whose number of iterations XLA does not know: the host reads the condition and launches what
+follows. A conditional counts in the same way, although XLA may put it into a CUDA graph, where the GPU decides.
 
 CUDA graphs, into which XLA may put kernels that follow one another, are made later and not seen here. Kernels inside a
 library's call (a matrix product, MuJoCo Warp's step) count as one.

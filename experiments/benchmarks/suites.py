@@ -35,6 +35,7 @@ class Request(NamedTuple):
     profile: bool
     parts: Sequence[str]  # of the suite gpu
     patience: float
+    minutes: float  # of the suite gpu
     compare: Sequence[str]
     peer_python: str
 
@@ -100,7 +101,7 @@ def _suites(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
 def _gpu(request: Request, timing: dict[str, Any]) -> Iterator[Part]:
     if "gpu" in request.suites:
         parts = measure_gpu.parts_of(request.parts, request.tasks[0], request.members, request.physics, **timing)
-        yield "gpu", measure_gpu.bench_gpu(parts, request.patience)
+        yield "gpu", measure_gpu.bench_gpu(parts, request.patience, request.minutes)
 
 
 def _growth(request: Request, timing: dict[str, Any]) -> Iterator[Part]:

@@ -4,6 +4,7 @@ A task is written once for the interface `Physics`; `PHYSICS` has its implementa
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -62,10 +63,10 @@ def _warp_lacks() -> str:
     if find_spec("warp") is None:
         return "the package warp-lang (pip install -e '.[warp]')"
     device = jax.devices()[0]
-    # An AMD GPU has the platform "gpu" too.
-    if device.platform != "gpu" or "cuda" not in device.client.platform_version.lower():
-        return f"an NVIDIA GPU as JAX's device, which is {device.platform}"
-    return ""
+    with suppress(RuntimeError):  # there is no CUDA
+        if device in jax.devices("cuda"):  # its platform is "gpu", and so is that of an AMD GPU
+            return ""
+    return f"an NVIDIA GPU as JAX's device, which is {device.platform}"
 
 
 # Physics with requirements: name -> a function that returns what this machine lacks, "" if nothing. It may start JAX.

@@ -8,8 +8,6 @@ Needs the package warp-lang (the extra `warp`). Warp also runs on a CPU, slowly,
 """
 
 import functools
-import os
-import re
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -58,13 +56,17 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
         for name, columns in written.items():
             warp.copy(outputs[:, columns], _rows(getattr(data, name)))
 
-    step_worlds = warp.jax_callable(control_step, graph_mode=_graph_mode(jax.default_backend()))
+    # Warp captures a call as one CUDA graph. XLA cannot: MuJoCo Warp does not work with GraphMode.JAX
+    # (mujoco/mjx/warp/forward_test.py).
+    modes = warp.JaxCallableGraphMode
+    graph_mode = modes.WARP if jax.default_backend() == "gpu" else modes.NONE
+    step_worlds = warp.jax_callable(control_step, graph_mode=graph_mode)
 
     @jax.custom_batching.custom_vmap
     def advance_all(inputs: Array) -> Array:
         """`control_step` for any leading axes: [..., the width of `read`] -> [..., width]"""
         rows = inputs.reshape(-1, inputs.shape[-1])
-        worlds(len(rows))  # while a graph is captured, nothing can be allocated
+        worlds(len(rows))  # before the first call, which is captured
         (outputs,) = step_worlds(rows, output_dims={"outputs": (len(rows), width)})
         return outputs.reshape(*inputs.shape[:-1], width)
 
@@ -91,17 +93,6 @@ def make(setup: Setup, iterations: int | None = None, ls_iterations: int | None 
     return Physics(make_mjx(setup).place, advance)
 
 
-def _graph_mode(backend: str) -> warp.JaxCallableGraphMode:
-    """Who captures a call as one CUDA graph on a GPU: Warp, or XLA if it was asked to put loops into graphs.
-
-    A loop in a graph cannot contain a call with a graph of its own.
-    """
-    if backend != "gpu":
-        return warp.JaxCallableGraphMode.NONE
-    in_xlas = re.search(r"xla_gpu_enable_command_buffer=\S*WHILE", os.environ.get("XLA_FLAGS", ""))
-    return warp.JaxCallableGraphMode.JAX if in_xlas else warp.JaxCallableGraphMode.WARP
-
-
 def _columns(model: mujoco.MjModel, names: Sequence[str]) -> dict[str, slice]:
     """Where the numbers of each field of MuJoCo's data are, in a row of all of them."""
     data, columns, start = mujoco.MjData(model), {}, 0
@@ -117,14 +108,23 @@ def _rows(field: Any) -> Any:
 
 
 def _make_worlds(host_model: mujoco.MjModel, count: int, external_forces: bool) -> dict[str, tuple[Any, Any]]:
-    """Warp's model and the data of `count` worlds, by device."""
+    """Warp's model and the data of `count` worlds, by device. All kernels of a control step are compiled too.
+
+    Both have to exist before a call is captured: a capture records kernels; it should not allocate or compile.
+    """
     largest = mjx.make_data(host_model, impl="jax")._impl  # MJX's arrays have a row for everything that can touch
     room = {"naconmax": count * largest.contact.dist.shape[0], "njmax": largest.efc_J.shape[0]}
     made = {}
-    for device in warp.get_cuda_devices() if jax.default_backend() == "gpu" else [warp.get_device("cpu")]:
+    for device in dict.fromkeys(map(_name_in_warp, jax.local_devices())):
         with warp.ScopedDevice(device):
             model, data = mujoco_warp.put_model(host_model), mujoco_warp.make_data(host_model, nworld=count, **room)
             model.opt.run_rne_postconstraint = external_forces
-            mujoco_warp.step(model, data)  # compiles the kernels, for the same reason
-        made[str(device)] = model, data
+            mujoco_warp.reset_data(model, data)
+            mujoco_warp.step(model, data)
+            warp.synchronize_device(device)  # JAX's calls are on another stream
+        made[device] = model, data
     return made
+
+
+def _name_in_warp(device: jax.Device) -> str:
+    return f"cuda:{device.local_hardware_id}" if device.platform == "gpu" else "cpu"
