@@ -143,6 +143,7 @@ def test_commands_that_train_are_valid(argv, tmp_path, monkeypatch):
         return
     if any(word.startswith("--env=playground:") for word in argv):
         pytest.importorskip("mujoco_playground", reason="needs the extra playground")
+    argv = [word.replace("--physics=warp", "--physics=mjx") for word in argv]  # warp needs a GPU
     options = flags.parse([*argv, f"--out={tmp_path}", "--replay_capacity=1000"])
     try:
         assert make_plan(options, own_environment(options)).members

@@ -38,8 +38,8 @@ class Part(NamedTuple):
     @property
     def what(self) -> str:
         """Its name in a failure."""
-        case = {name: value for name, value in self.arguments.items() if name not in ("seconds", "repeats")}
-        return f"{self.kind}: {', '.join(map(str, case.values()))}"
+        case = [str(self.arguments[name]) for name in ("algo", "task", "physics", "members") if name in self.arguments]
+        return f"{self.kind}: {', '.join(case)}{self.arguments.get('label', '')}"
 
 
 def parts_of(
