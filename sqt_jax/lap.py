@@ -2,7 +2,7 @@
 
 A row is drawn with probability proportional to its priority. Priorities are stored in blocks of 128, with a level of
 sums of blocks, a level of sums of those, and so on. A draw reads one block of each level, a new priority rewrites one
-sum of each level; neither depends on the capacity. A sum is always computed from its block, never adjusted: rounding
+sum of each level; neither grows with the capacity. A sum is always computed from its block, never adjusted: rounding
 errors cannot accumulate. The largest priority of each block is kept too, so that the largest of all is found without a
 branch.
 """

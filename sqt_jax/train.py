@@ -178,9 +178,7 @@ def make_trainer(
 
         count = updates if learn else 0
         carry = (agent_state, replay_state, state.means)
-        # At a loop a GPU waits for the host, which reads the condition: not for a single update.
-        carry = update(0, carry) if count == 1 else jax.lax.fori_loop(0, count, update, carry)
-        agent_state, replay_state, means = carry
+        agent_state, replay_state, means = jax.lax.fori_loop(0, count, update, carry)
         env_steps = state.env_steps + num_envs
         diverges_now = agent_state.diverged & (state.diverged_at < 0)
         return TrainState(

@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import itertools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -72,13 +73,17 @@ def tiny_tasks() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module", autouse=True)
+_ended = itertools.count(1)  # tests of this process
+
+
+@pytest.fixture(autouse=True)
 def _room_for_programs() -> Iterator[None]:
     """Forgets compiled programs before the process runs out of memory maps (65,530 on Linux; XLA then crashes)."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_text().count("\n") > 30_000:
+    if next(_ended) % 5 == 0 and maps.exists() and maps.read_text().count("\n") > 35_000:
         jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

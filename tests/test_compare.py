@@ -8,6 +8,7 @@ import pytest
 
 from experiments.benchmarks import compare, measurements
 from experiments.benchmarks.measurements import Failure, Measurement, Prepared
+from experiments.benchmarks.timing import Timed
 
 
 def test_a_missing_package_of_an_interpreter_is_found(monkeypatch):
@@ -61,7 +62,7 @@ def compared(monkeypatch, members, run=lambda steps: None):
     def timed(run):
         processes = run.processes if isinstance(run, Peer) else 0
         runs.append(processes)
-        return (12.0 if processes == 1 else 10.0), 0.5
+        return Timed((12.0 if processes == 1 else 10.0,) * 3, 0.5)
 
     monkeypatch.setattr(compare, "usable_cores", lambda: 2)
     monkeypatch.setattr(compare, "updates", lambda algo, task, members, devices: Prepared(run, operations=7.0))
@@ -110,7 +111,7 @@ def test_pytorch_uses_our_device(monkeypatch, backend, device):
 
 def test_our_rate_is_compared_with_the_peers_best():
     def row(what, members, rate):
-        return Measurement("compare", what, members, "env steps", rate, 0.0)
+        return Measurement("compare", what, members, "env steps", rate)
 
     rows = [
         row("td3 on ant, sqt_jax, mujoco", 5, 300.0),
@@ -119,7 +120,7 @@ def test_our_rate_is_compared_with_the_peers_best():
         row("td3 on ant, sbx, 2 processes", 5, 150.0),
         row("td3 on ant, sbx", 1, 400.0),
         row("sac on ant, sbx, 2 processes", 5, 900.0),
-        Measurement("loop", "td3 on ant, mujoco", 5, "env steps", 300.0, 0.0),
+        Measurement("loop", "td3 on ant, mujoco", 5, "env steps", 300.0),
     ]
     assert compare.ratios(rows) == [
         "td3 on ant, sqt_jax, mujoco, 5 members / sbx, 2 processes = 2.00",

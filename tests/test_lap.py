@@ -1,4 +1,4 @@
-"""LAP's sums against NumPy, its sampling against exact probabilities, and that its cost does not grow with capacity."""
+"""LAP's sums against NumPy, its sampling against exact probabilities, and what grows with the capacity."""
 
 import re
 from functools import cache

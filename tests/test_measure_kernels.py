@@ -25,8 +25,9 @@ def test_a_case_gives_the_kernels_and_the_syncs_with_their_parts():
 
 @pytest.mark.slow
 @pytest.mark.skipif(gpu_target.lacks_plugin(), reason="needs the extra kernels")
-@pytest.mark.parametrize(("algo", "most"), [("td3_sqt", 250), ("sac_sqt", 250), ("td7_sqt", 450)])
-def test_a_step_launches_at_most_so_many_kernels(algo, most):
+@pytest.mark.parametrize(("algo", "most", "reads"), [("td3_sqt", 127, 4), ("sac_sqt", 156, 3), ("td7_sqt", 333, 6)])
+def test_a_step_launches_at_most_so_many_kernels(algo, most, reads):
+    """A tenth more than in experiments/results/gpu_program.md."""
     pytest.importorskip("warp", reason="needs the extra kernels")
-    kernels, _ = measure_kernels.bench_kernels(algo, "ant", 25, "warp")
-    assert 50 < kernels.rate <= most
+    kernels, syncs = measure_kernels.bench_kernels(algo, "ant", 25, "warp")
+    assert 50 < kernels.rate <= most and 2 <= syncs.rate <= reads

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from gym_reference import recorded
 
 from sqt_jax import envs
 from sqt_jax.envs import gym_tasks
@@ -102,6 +103,27 @@ def test_off_the_cpu_the_callback_gives_the_same(ant, monkeypatch):
     expected = advance(state, control)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, cpu: default(*args))
     assert same(jax.jit(jax.vmap(physics.advance))(state, control), expected)
+
+
+@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.quantities])
+def test_first_observations_are_gymnasiums(name):
+    """Also after other robots have moved in MuJoCo's memory, which keeps their forces."""
+    rows, env = recorded(name), envs.make(name, "mujoco")
+    place, step = jax.jit(jax.vmap(env.set_physics)), jax.jit(jax.vmap(env.step))
+    step(place(rows.qpos, rows.qvel), jnp.ones_like(rows.action))
+    np.testing.assert_allclose(place(rows.qpos, rows.qvel).obs, rows.first_obs, rtol=1e-5, atol=1e-5)
+
+
+def test_robots_are_placed_alike_in_any_batch_and_off_the_cpu(monkeypatch):
+    setup = setup_of("humanoid")
+    physics, generator = mujoco_c.make(setup), np.random.default_rng(0)
+    qpos = jnp.float32(setup.model.qpos0 + generator.uniform(-0.1, 0.1, (2, 3, setup.model.nq)))
+    qvel = jnp.float32(generator.normal(size=(2, 3, setup.model.nv)))
+    together = jax.jit(jax.vmap(jax.vmap(physics.place)))(qpos, qvel)
+    assert np.ptp(together.quantities["cinert"], axis=(0, 1)).max() > 0.01
+    assert same(physics.place(qpos[1, 2], qvel[1, 2]), jax.tree.map(lambda leaf: leaf[1, 2], together))
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, cpu: default(*args))
+    assert same(jax.jit(jax.vmap(physics.place))(qpos[1], qvel[1]), jax.tree.map(lambda leaf: leaf[1], together))
 
 
 def test_the_state_is_carried_in_float64(ant):

@@ -12,7 +12,7 @@ from experiments.benchmarks.kernels import Kind
 from experiments.benchmarks.measurements import Failure, Measurement
 from experiments.benchmarks.part_process import line, output_of, parsed, reason, results
 
-FOUND = Measurement("loop", "a", 5, "env steps", 12.5, 3.0, kinds=(Kind("dot", 2.0, 0.5),))
+FOUND = Measurement("loop", "a", 5, "env steps", 12.5, 3.0, kinds=(Kind("dot", 2.0, 0.5),), rates=(12.5, 13.0))
 
 
 def run(program, limit=60.0):

@@ -6,6 +6,7 @@ measured, interleaved with ours. Parallel processes share the cores among them.
 
 import functools
 import os
+import statistics
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -17,6 +18,7 @@ from experiments.benchmarks.measure_loops import loop_steps
 from experiments.benchmarks.measure_updates import updates
 from experiments.benchmarks.measurements import Case, Failure, Measurement, Prepared, measure_cases
 from experiments.benchmarks.peer_process import PeerProcesses
+from experiments.benchmarks.ratio import ratio_text
 from sqt_jax import envs
 from sqt_jax.envs import gym_table
 from sqt_jax.job_limits import usable_cores
@@ -82,13 +84,14 @@ def compare(
       timing: `seconds` and `repeats` of `timing.measure`.
     """
 
-    def measurement(name: str, count: int, rate: float = 0.0, devices: int = 1) -> Measurement:
+    def measurement(name: str, count: int, rates: tuple[float, ...] = (), devices: int = 1) -> Measurement:
         return Measurement(
             suite="compare",
             what=f"{algo} on {task}, {name}",
             members=count,
             unit=UNITS[peer],
-            rate=rate,
+            rate=statistics.median(rates) if rates else 0.0,
+            rates=rates,
             devices=devices,
         )
 
@@ -110,7 +113,7 @@ def compare(
         ours = [Case(measurement("sqt_jax", members, devices=devices), update)]
     counts = process_counts(members)
     rests = {members % count for count in counts} - {0}
-    rates: dict[int, float] = {}
+    rates: dict[int, list[float]] = {}  # of one process, in each repeat, by the number of parallel processes
     with ExitStack() as stack:
 
         def start(count: int) -> Prepared:
@@ -125,11 +128,12 @@ def compare(
             if isinstance(found, Failure) or "sqt_jax" in found.what:
                 yield found
             else:
-                rates[found.members] = found.rate / found.members
+                rates[found.members] = [rate / found.members for rate in found.rates]
     for count in counts:
         if {count, members % count} - {0} <= rates.keys():
             name = peer if members == 1 else _label(peer, count)
-            yield measurement(name, members, rate_of_all(members, count, rates))
+            repeats = [dict(zip(rates, row, strict=True)) for row in zip(*rates.values(), strict=True)]
+            yield measurement(name, members, tuple(rate_of_all(members, count, repeat) for repeat in repeats))
 
 
 def _label(peer: str, processes: int) -> str:
@@ -150,6 +154,6 @@ def ratios(measurements: Sequence[Measurement]) -> list[str]:
             ]
             if theirs:
                 best = max(theirs, key=lambda other: other.rate)
-                ratio = f"{found.rate / best.rate:.2f}"
+                ratio = ratio_text(found, best)
                 lines.append(f"{found.what}, {found.members} members / {best.what.partition(', ')[2]} = {ratio}")
     return lines

@@ -2,9 +2,10 @@
 
 The unit is one iteration of the program's outer loop, the lockstep step: kernels outside it are left out, those of a
 loop with a known number of iterations are multiplied, and those of a branch are weighted by how often it runs. A branch
-is a loop of one iteration or none (`sqt_jax.conditional`), so our programs have no conditionals. A GPU synchronises
-with the host at a loop whose number of iterations XLA does not know: the host reads the condition and launches what
-follows. A conditional counts in the same way, although XLA may put it into a CUDA graph, where the GPU decides.
+is a loop of one iteration or none (`sqt_jax.conditional`). A GPU synchronises with the host at a loop whose number of
+iterations XLA does not know: the host reads the condition before each iteration and after the last one, so twice if a
+branch runs and once if it does not. A conditional counts as one read, although XLA may put it into a CUDA graph, where
+the GPU decides; our programs have none.
 
 CUDA graphs, into which XLA may put kernels that follow one another, are made later and not seen here. Kernels inside a
 library's call (a matrix product, MuJoCo Warp's step) count as one.
@@ -27,7 +28,7 @@ class Launches(NamedTuple):
     """Per lockstep step, by part of it: the innermost of the given scopes that an operation belongs to."""
 
     kernels: dict[str, float]
-    host_syncs: dict[str, float]  # loops and conditionals at which the host reads a condition
+    host_syncs: dict[str, float]  # how often the host reads a condition
 
     @property
     def total(self) -> float:
@@ -54,7 +55,7 @@ def count(text: str, parts: Sequence[str], rare: Mapping[str, float]) -> Launche
     kernels: defaultdict[str, float] = defaultdict(float)
     host_syncs: defaultdict[str, float] = defaultdict(float)
     [outer] = [line for line in blocks[entry] if _operation(line) == "while"]
-    waiting = [_Block(_target(outer, "body"), _scope(outer), 1.0)]
+    waiting = [_Block(_target(outer, name), _scope(outer), 1.0) for name in ("body", "condition")]
     host_syncs["the loop of steps"] = 1.0
     while waiting:
         block = waiting.pop()
@@ -65,11 +66,13 @@ def count(text: str, parts: Sequence[str], rare: Mapping[str, float]) -> Launche
                 kernels[part] += block.times
             elif operation in ("while", "conditional"):
                 known = re.search(r'"known_trip_count":\{"n":"(\d+)"\}', line)
-                if not known:
-                    host_syncs[part] += block.times
-                share = _share(scope, block.scope, rare)
-                times = block.times * (int(known[1]) if known else share)
+                times = block.times * (int(known[1]) if known else _share(scope, block.scope, rare))
                 waiting += [_Block(name, scope, times) for name in _run_by(line, operation)]
+                if not known:
+                    reads = block.times + (times if operation == "while" else 0)
+                    host_syncs[part] += reads
+                    if operation == "while":
+                        waiting.append(_Block(_target(line, "condition"), scope, reads))
             elif operation in ("call", "async-start"):
                 name = _target(line, "to_apply") or _target(line, "calls")
                 waiting.append(_Block(name, scope, block.times))

@@ -37,7 +37,7 @@ def compile_and_count(algo: str, task: str, physics: str, members: int) -> launc
     state = jax.eval_shape(layout.over_members(trainer.init, (0, 0), axes), keys, scalars)
     advance = layout.over_members(partial(trainer.advance, learn=True), (axes, None), axes)
     text = gpu_target.compiled_text(advance, state, jax.ShapeDtypeStruct((), jnp.int32), donate=0)
-    # Each member's episodes end at most so often, and at a step of their own.
+    # As if no robot fell: each member's episodes end at their time limit, and at a step of their own.
     ends = min(1.0, members / sqt_jax.make_env(task, physics=physics).episode_length)
     return launches.count(text, PARTS, {"restart": ends, "observe": ends})
 

@@ -41,6 +41,7 @@ class Measurement:
     devices: int = 1
     kinds: tuple[kernels.Kind, ...] | None = None  # device operations of a lockstep step; None: not profiled
     point: tuple[str, str, int] | None = None  # of a growth figure: varied quantity, line, value
+    rates: tuple[float, ...] = ()  # of each repeat; `rate` is their median
 
     @property
     def figure(self) -> tuple[str, str]:
@@ -89,11 +90,11 @@ def measure_cases(cases: Sequence[Case], profiled: bool = False, **timing: Any) 
         if isinstance(found, Exception):
             yield failure(measurement, found)
             continue
-        rate, first_seconds = found
         measurement = dataclasses.replace(
             measurement,
-            rate=rate * measurement.members,
-            compile_seconds=first_seconds if prepared.compile_seconds is None else prepared.compile_seconds,
+            rate=found.rate * measurement.members,
+            rates=tuple(rate * measurement.members for rate in found.rates),
+            compile_seconds=found.compile_seconds if prepared.compile_seconds is None else prepared.compile_seconds,
             operations=prepared.operations,
         )
         if profiled:

@@ -11,6 +11,7 @@ from rich.table import Table
 from experiments.benchmarks import compare, growth, kernels
 from experiments.benchmarks.machine import machine
 from experiments.benchmarks.measurements import Failure, Measurement, with_devices
+from experiments.benchmarks.ratio import ratio_text
 from experiments.commandline.arguments import UsageError
 from experiments.running import files
 from experiments.surroundings.consoles import console
@@ -102,6 +103,6 @@ def physics_ratios(measurements: Sequence[Measurement]) -> list[str]:
         task, _, physics = what.removesuffix(on_devices).partition(", ")
         reference = REFERENCES.get((suite, physics), "")
         if other := by_case.get((suite, f"{task}, {reference}{on_devices}", members)):
-            ratio = found.rate / other.rate
-            lines.append(f"{task}, {members} members{on_devices}: {physics} / {reference} = {ratio:.2f}")
+            ratio = ratio_text(found, other)
+            lines.append(f"{task}, {members} members{on_devices}: {physics} / {reference} = {ratio}")
     return lines

@@ -36,7 +36,7 @@ def parsed(text: str) -> Measurement | Failure | None:
         return Failure(**content)
     if content["kinds"] is not None:
         content["kinds"] = tuple(Kind(*kind) for kind in content["kinds"])
-    return Measurement(**content)
+    return Measurement(**content | {"rates": tuple(content["rates"])})
 
 
 def results(

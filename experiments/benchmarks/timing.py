@@ -3,9 +3,21 @@
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+
+
+class Timed(NamedTuple):
+    """A loop's timed calls."""
+
+    rates: tuple[float, ...]  # iterations per second of each, in their order
+    compile_seconds: float  # of the first call
+
+    @property
+    def rate(self) -> float:
+        """Their median."""
+        return statistics.median(self.rates)
 
 
 def measure(run: Callable[[int], Any], seconds: float, repeats: int) -> tuple[float, float]:
@@ -35,14 +47,12 @@ def measure_interleaved(
     for found in rates_or_errors(runs, seconds, repeats):
         if isinstance(found, Exception):
             raise found
-        rates.append(found)
+        rates.append((found.rate, found.compile_seconds))
     return rates
 
 
-def rates_or_errors(
-    runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int
-) -> list[tuple[float, float] | Exception]:
-    """`measure_interleaved`, with a run's exception in place of its result. It is not called again after that."""
+def rates_or_errors(runs: Sequence[Callable[[int], Any]], seconds: float, repeats: int) -> list[Timed | Exception]:
+    """The timed calls of `measure_interleaved`, or the exception of a run, which is not called again after that."""
     failed: dict[int, Exception] = {}
 
     def for_each(function: Callable[[int], Any]) -> dict[int, Any]:
@@ -72,6 +82,6 @@ def rates_or_errors(
     counts = for_each(iterations_of)
     rates = [for_each(lambda index: counts[index] / timed(index, counts[index])) for _ in range(repeats)]
     return [
-        failed[index] if index in failed else (statistics.median(rate[index] for rate in rates), compile_seconds[index])
+        failed[index] if index in failed else Timed(tuple(rate[index] for rate in rates), compile_seconds[index])
         for index in range(len(runs))
     ]

@@ -192,6 +192,7 @@ class Stepper:
     def placed_quantities(self, rows: np.ndarray) -> np.ndarray:
         """The quantities [R, Q] float32 of robots that were just placed at `rows` [R, nq + nv], without forces."""
         quantities = np.empty((len(rows), self.num_quantities), np.float32)
+        # Blank memory: that of robots that have moved holds their forces. A call is rare, so it has one thread.
         model, data = self.model, mujoco.MjData(self.model)
         for i, row in enumerate(rows):
             data.qpos, data.qvel = row[: model.nq], row[model.nq :]
