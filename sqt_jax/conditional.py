@@ -27,7 +27,7 @@ def apply_if(predicate: Array, function: Callable[[Any], Any], state: Any) -> An
       function: returns a tree with the structure, shapes and dtypes of `state`.
     """
 
-    # That the condition computes nothing marks the loop as a branch for the benchmarks (`operations`, `launches`).
+    # The condition computes nothing. By that, benchmarks/operations.py tells a branch from a loop.
     def once(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         return jnp.zeros((), bool), function(carry[1])
 

@@ -94,7 +94,8 @@ def lap(
 
     def init() -> LapState:
         levels = tuple(jnp.zeros(shape) for shape in _shapes(ring.capacity))
-        return LapState(ring.init(), levels, jnp.zeros(len(levels[0])), jnp.ones(()))
+        block_max = jnp.zeros(len(levels[0]))
+        return LapState(rows=ring.init(), levels=levels, block_max=block_max, max_priority=jnp.ones(()))
 
     def with_priorities(state: LapState, index: Array, value: Array) -> LapState:
         """The state with the priorities `value [B]` of the rows `index [B]`."""

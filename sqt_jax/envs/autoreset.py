@@ -110,11 +110,10 @@ def make_environment(
     """
 
     # `jit` here and around `step`: JAX then traces once for the warm-up, training and each `vmap` around a restart.
-    def make_start(key: Array) -> tuple[State, Array]:
+    @jax.jit
+    def begin(key: Array) -> tuple[State, Array]:
         task, obs = start(key)
         return task, jnp.asarray(obs, jnp.float32)
-
-    begin = jax.jit(make_start)
 
     def first_timestep(task: State, obs: Array, key: Array, start_key: Array) -> TimeStep:
         finite = in_range(obs)

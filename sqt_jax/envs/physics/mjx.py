@@ -87,7 +87,7 @@ def make(setup: Setup, iterations: int | None = 8, ls_iterations: int | None = 8
             mean_acceleration += weight * data.qacc
             return state, velocity, data.qacc, mean_velocity, mean_acceleration
 
-        zero = 0.0 * qvel  # with the axes of qvel: `vmap` would else trace the loop twice, to find that they get them
+        zero = 0.0 * qvel  # not `zeros_like`: without the batch axes of qvel, `vmap` traces the loop twice
         state, _, last, velocity, acceleration = jax.lax.fori_loop(0, 4, stage, (state, zero, zero, zero, zero))
         return state._replace(
             qpos=move(qpos, velocity),
